@@ -155,8 +155,9 @@ struct proc_stat {
 
 /* Reads a whole small file of /proc.  Returns its length or -1 with errno. */
 ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size);
-/* Reads a whole file, as a string: into `first` if that is large enough, else allocated, because
- * the application determines its length. NULL with errno; EFBIG: too long. */
+/* Reads a whole file of one record (status, fdinfo), as a string: into `first` if that is large
+ * enough, else allocated, because the application determines its length. NULL with errno; EFBIG: too
+ * long. */
 #define PROC_TEXT_MAX (8u << 20) /* about 100,000 watched descriptors, or 60,000 files */
 char *proc_text(pid_t pid, const char *name, char *first, size_t first_bytes);
 int proc_stat(pid_t pid, struct proc_stat *stat);
@@ -247,6 +248,9 @@ struct mapping {
 	char name[64];  /* its beginning                                    */
 };
 
+/* Opens a file of many lines.  The kernel fills a page for each read(2), if there is room. */
+#define PROC_LINES 4096
+FILE *proc_lines(pid_t pid, const char *name, char buffer[PROC_LINES]);
 /* Calls fn for every mapping of /proc/PID/maps or (slow) smaps; stops when it
  * returns < 0.  0 or -1. */
 int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *mapping, void *arg),
@@ -294,6 +298,8 @@ struct proc_status {
 };
 
 int proc_status(pid_t tid, struct proc_status *status);
+/* The same from its status file that is open; -1: from that of `tid`. */
+int proc_status_of(int status_fd, pid_t tid, struct proc_status *status);
 /* "/proc/PID/NAME" opened, or -1 with errno. */
 int proc_open(pid_t pid, const char *name, int flags);
 /* Opens what is mapped there (proc(5), map_files); -1 with errno. Needs CAP_CHECKPOINT_RESTORE or
@@ -369,8 +375,8 @@ struct mounts {
 void mounts_free(struct mounts *mounts);
 /* The type of the one that a descriptor is on, without asking it; "": it is none of these. */
 const char *mount_type(struct mounts *mounts, pid_t pid, int fd);
-/* Whether any of these is served, as far as known. */
-bool mounts_may_be_served(const struct mounts *mounts);
+/* Whether any of these is served, or none is known. */
+bool mounts_may_be_served(struct mounts *mounts, pid_t pid);
 /* Whether what is on that device (struct mapping) is memory by memfd_create(2) or shmget(2), to which
  * no path leads. */
 bool device_is_memory(uint64_t device);

@@ -72,13 +72,11 @@ bool mount_is_served(const char *type)
 
 static void read_mounts(struct mounts *mounts, pid_t pid)
 {
-	char path[48], *line = NULL;
+	char *line = NULL, buffer[PROC_LINES];
 	struct proc_mount mount;
 	size_t size = 0;
-	FILE *info;
+	FILE *info = proc_lines(pid, "mountinfo", buffer);
 
-	snprintf(path, sizeof path, "/proc/%d/mountinfo", pid);
-	info = fopen(path, "re");
 	mounts->read = true;
 	while (info && getline(&line, &size, info) > 0 && proc_parse_mount(line, &mount) &&
 	       make_room(&mounts->mount, mounts->count, &mounts->room, sizeof *mounts->mount)) {
@@ -104,12 +102,14 @@ const char *mount_type(struct mounts *mounts, pid_t pid, int fd)
 	return "";
 }
 
-bool mounts_may_be_served(const struct mounts *mounts)
+bool mounts_may_be_served(struct mounts *mounts, pid_t pid)
 {
+	if (!mounts->read)
+		read_mounts(mounts, pid);
 	for (uint32_t i = 0; i < mounts->count; i++)
 		if (mount_is_served(mounts->mount[i].type))
 			return true;
-	return !mounts->read;
+	return !mounts->count;
 }
 
 void mounts_free(struct mounts *mounts)

@@ -93,8 +93,10 @@ char *proc_text(pid_t pid, const char *name, char *first, size_t first_bytes)
 		char *more;
 
 		used += (size_t)n;
-		if (used < room - 1)
-			continue;
+		if (used < room - 1) {
+			n = 0; /* it has one record (fs/seq_file.c, single_open()) */
+			break;
+		}
 		if (used > PROC_TEXT_MAX) {
 			errno = EFBIG;
 			n = -1;
@@ -235,14 +237,11 @@ void proc_await_end(pid_t tid)
 	}
 }
 
-int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max)
+static int read_children(int fd, pid_t *children, int max)
 {
-	char name[32], buf[CHILDREN_MAX * sizeof "4194304"];
-	int fd;
+	char buf[CHILDREN_MAX * sizeof "4194304"];
 	ssize_t n;
 
-	snprintf(name, sizeof name, "%d/children", tid);
-	fd = openat(task_dirfd, name, O_RDONLY | O_CLOEXEC);
 	if (fd < 0)
 		return -1;
 	/* A read(2) of many of these files returns at most a page. */
@@ -254,27 +253,41 @@ int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max)
 	return proc_parse_children(buf, children, max);
 }
 
+int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max)
+{
+	char name[32];
+
+	snprintf(name, sizeof name, "%d/children", tid);
+	return read_children(openat(task_dirfd, name, O_RDONLY | O_CLOEXEC), children, max);
+}
+
 int proc_children(pid_t pid, pid_t *children, int max)
 {
-	const int task_dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
-	int count;
+	char name[32];
 
-	if (task_dirfd < 0)
-		return -1;
-	count = proc_children_of(task_dirfd, pid, children, max);
-	close(task_dirfd);
-	return count;
+	snprintf(name, sizeof name, "task/%d/children", pid);
+	return read_children(proc_open(pid, name, O_RDONLY), children, max);
+}
+
+FILE *proc_lines(pid_t pid, const char *name, char buffer[PROC_LINES])
+{
+	char path[64];
+	FILE *lines;
+
+	snprintf(path, sizeof path, "/proc/%d/%s", pid, name);
+	lines = fopen(path, "re");
+	if (lines)
+		(void)setvbuf(lines, buffer, _IOFBF, PROC_LINES);
+	return lines;
 }
 
 int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *mapping, void *arg),
 		  void *arg)
 {
-	char path[64];
+	char buffer[PROC_LINES];
+	FILE *maps = proc_lines(pid, file, buffer);
 	int result;
-	FILE *maps;
 
-	snprintf(path, sizeof path, "/proc/%d/%s", pid, file);
-	maps = fopen(path, "re");
 	if (!maps)
 		return -1;
 	result = proc_parse_mappings(maps, !strcmp(file, "smaps"), fn, arg);
@@ -293,6 +306,22 @@ int proc_status(pid_t tid, struct proc_status *status)
 	if (text != first)
 		free(text);
 	return result;
+}
+
+int proc_status_of(int status_fd, pid_t tid, struct proc_status *status)
+{
+	char text[8192];
+	ssize_t n;
+
+	if (status_fd < 0)
+		return proc_status(tid, status);
+	n = read_text(status_fd, text, sizeof text);
+	if (n == 0)
+		errno = ESRCH;
+	if (n <= 0)
+		return -1;
+	/* Very many groups */
+	return n == sizeof text - 1 ? proc_status(tid, status) : proc_parse_status(text, status);
 }
 
 int proc_limits(pid_t pid, uint64_t limit[LIMITS][2])

@@ -123,22 +123,29 @@ static uint32_t parse_flags(const char *p)
 
 static bool parse_mapping(const char *line, struct mapping *m)
 {
-	unsigned long start, end, offset, inode;
-	unsigned int major, minor;
-	int name = 0;
+	unsigned long major, minor;
+	size_t length;
+	char *p;
 
 	*m = (struct mapping){ 0 };
-	if (sscanf(line, "%lx-%lx %4s %lx %x:%x %lu %n", &start, &end, m->mode, &offset, &major,
-		   &minor, &inode, &name) < 7 ||
-	    strlen(m->mode) != 4)
+	m->start = strtoul(line, &p, 16);
+	if (p == line || *p != '-')
 		return false;
-	m->device = device_number(major, minor);
-	m->start = start;
-	m->end = end;
-	m->offset = offset;
-	m->inode = inode;
+	m->end = strtoul(p + 1, &p, 16);
+	if (*p != ' ' || strcspn(p + 1, " \n") != 4)
+		return false;
+	memcpy(m->mode, p + 1, 4);
 	m->shared = m->mode[3] == 's';
-	snprintf(m->name, sizeof m->name, "%.*s", (int)strcspn(line + name, "\n"), line + name);
+	m->offset = strtoul(p + 5, &p, 16);
+	major = strtoul(p, &p, 16);
+	if (*p != ':')
+		return false;
+	minor = strtoul(p + 1, &p, 16);
+	m->device = device_number((unsigned int)major, (unsigned int)minor);
+	m->inode = strtoul(p, &p, 10);
+	p += strspn(p, " ");
+	length = strcspn(p, "\n");
+	memcpy(m->name, p, length < sizeof m->name ? length : sizeof m->name - 1);
 	return true;
 }
 

@@ -148,7 +148,7 @@ static bool has_own_filter(const struct process *process)
 	struct proc_status status;
 
 	return process->parasite.seccomp == SECCOMP_SUPERVISED ||
-	       proc_status(process->pid, &status) ||
+	       proc_status_of(process->status_fd, process->pid, &status) ||
 	       !seccomp_is_containers(&status, process->plain_filters);
 }
 

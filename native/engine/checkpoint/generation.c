@@ -161,29 +161,28 @@ static int fill_slot(struct image *image, struct avc_error *err)
 	const struct proc_stat *stat = &image->stat;
 	struct proc_status status;
 	struct setup setup;
-	int mem_fd = proc_open(image->template, "mem", O_RDONLY);
+	int mem_fd;
 
-	if (mem_fd < 0)
-		return fail_errno(err, image->template, "keep template", "open(mem)",
-				  "it was killed");
-	if (proc_status(process->pid, &status) &&
-	    (!process->descendant || proc_status(image->template, &status))) {
-		close(mem_fd);
+	/* A child can have exited since the freeze. */
+	if (proc_status_of(process->status_fd, process->pid, &status) == 0)
+		file_rights_note(&image->files->rights, process->pid, &status);
+	else if (process->descendant && proc_status(image->template, &status) == 0)
+		file_rights_note(&image->files->rights, image->template, &status);
+	else
 		return fail_errno(err, process->pid, "keep template", "open(status)",
 				  "it has ended");
-	}
-	if (status.seccomp_filters > process->filters) { /* one that has ended has none */
-		close(mem_fd);
+	if (status.seccomp_filters > process->filters) /* one that has ended has none */
 		return fail(err, AVC_RETRY, 0, process->pid, "keep template", "",
 			    "its seccomp filters have just changed");
-	}
 	image->headless = process->pid != process->leader;
 	image->stop_signal = main_thread->stop_signal;
 	setup_begin(&setup, parasite, image->slot);
-	if (filters_setup(image, main_thread, &setup, err)) {
-		close(mem_fd);
+	if (filters_setup(image, main_thread, &setup, err))
 		return -1;
-	}
+	mem_fd = process->thread_count > 1 ? proc_open(image->template, "mem", O_RDONLY) : -1;
+	if (process->thread_count > 1 && mem_fd < 0)
+		return fail_errno(err, image->template, "keep template", "open(mem)",
+				  "it was killed");
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		struct thread t = process->threads[i];
 		const uint32_t b = (uint32_t)t.block;
@@ -230,13 +229,13 @@ static int fill_slot(struct image *image, struct avc_error *err)
 		setup_thread(&setup, block);
 		if (attributes_setup_thread(process, main_thread, &process->threads[i], &setup,
 					    err)) {
-			close(mem_fd);
+			close_fd(&mem_fd);
 			return -1;
 		}
 		pending_setup_thread(process, &t, &setup);
 		filters_setup_thread(image, &process->threads[i], &setup);
 	}
-	close(mem_fd);
+	close_fd(&mem_fd);
 	if (image->headless)
 		fill_ended(image);
 	image->sandboxed = image->installs ||

@@ -30,6 +30,8 @@
 
 #include "files.h"
 
+/* A number that no other mount gets, since Linux 6.8. */
+#define STATX_MNT_ID_UNIQUE_ 0x4000
 #define FUSE_MINOR 229 /* include/linux/miscdevice.h                                   */
 #define ROOM_SPARE 64
 #define OURS_MAX 1024 /* duplicates at a time                                          */
@@ -41,6 +43,28 @@
 const char files_serves[] = "it serves a file system (FUSE): after a restore, requests that it had "
 			    "read would have no answer";
 
+static const struct {
+	const char *prefix, *reason;
+} refused[] = {
+	{ "anon_inode:[io_uring]", "it uses io_uring (most programs do without: "
+				   "avckpt.io_uring=off)" },
+	{ "anon_inode:[userfaultfd]", "it uses userfaultfd" },
+	{ "anon_inode:[perf_event]", "it has performance counters open" },
+	{ "/dev/nvidia", "it has a GPU device open" },
+	{ "/dev/dri/", "it has a GPU device open" },
+	{ "/dev/kfd", "it has a GPU device open" },
+	{ "/dev/kvm", "it runs virtual machines" },
+	{ "/dev/fuse", files_serves },
+};
+
+const char *files_refuses(const char *name)
+{
+	for (size_t i = 0; i < sizeof refused / sizeof *refused; i++)
+		if (!strncmp(name, refused[i].prefix, strlen(refused[i].prefix)))
+			return refused[i].reason;
+	return NULL;
+}
+
 struct look {
 	struct files *files, *known;
 	pid_t pid, init;
@@ -48,6 +72,7 @@ struct look {
 	enum files_depth depth;
 	bool trusts;    /* heirs are assumed unchanged: files_check_heirs() */
 	uint32_t later; /* how many new sockets may still be left to the freeze */
+	const char *refuses;
 	struct {
 		uint64_t dev, ino; /* 0: unknown */
 	} init_stdio[3];
@@ -170,6 +195,17 @@ static char *read_name(const struct look *look, int fd)
 		return NULL;
 	name[n] = 0;
 	return budget_take((uint64_t)n) ? strdup(name) : NULL;
+}
+
+static bool learn_name(struct look *look, struct file *f)
+{
+	f->name = read_name(look, f->fd);
+	if (!f->name)
+		return false;
+	f->kind = kind_of(f);
+	if (!look->refuses)
+		look->refuses = files_refuses(f->name);
+	return true;
 }
 
 /* stdio shared with init: other processes use the same offset. */
@@ -506,18 +542,18 @@ static enum looked look_at_running(struct look *look, int number, struct file *f
 {
 	const int sync = look->depth == FILES_BEFORE ? AT_STATX_SYNC_AS_STAT : AT_STATX_DONT_SYNC;
 	enum looked result = LOOKED;
+	const struct file *was;
 	char name[16];
 	struct statx st;
 
 	snprintf(name, sizeof name, "%d", number);
 	*f = (struct file){ .fd = number, .shared = number, .offset = -1, .told_flags = -1 };
-	if (statx(look->fd_dir, name, sync | AT_NO_AUTOMOUNT, STATX_BASIC_STATS, &st))
+	if (statx(look->fd_dir, name, sync | AT_NO_AUTOMOUNT,
+		  STATX_BASIC_STATS | STATX_MNT_ID_UNIQUE_, &st))
 		return LOOKED_CLOSED;
 	note_stat(f, &st);
-	f->name = read_name(look, number);
-	if (!f->name)
+	if (!learn_name(look, f))
 		return LOOKED_CLOSED;
-	f->kind = kind_of(f);
 	file_read_info(look->pid, f);
 	f->flags = f->told_flags & ~O_CLOEXEC;
 	f->offset = look->depth == FILES_BEFORE ? -1 : f->told_offset;
@@ -534,8 +570,12 @@ static enum looked look_at_running(struct look *look, int number, struct file *f
 		return result;
 	}
 	f->outside = is_inits(look, f);
-	f->remote = (f->kind == FILE_REGULAR || f->kind == FILE_DIRECTORY) &&
-		    !(f->flags & O_PATH) && is_on_server(look, name, f);
+	if ((f->kind == FILE_REGULAR || f->kind == FILE_DIRECTORY) && !(f->flags & O_PATH)) {
+		f->mount = st.stx_mask & STATX_MNT_ID_UNIQUE_ ? st.stx_mnt_id : 0;
+		was = look->known && f->mount ? files_find(look->known, number) : NULL;
+		f->remote = was && was->mount == f->mount ? was->remote
+							  : is_on_server(look, name, f);
+	}
 	return LOOKED;
 }
 
@@ -598,12 +638,10 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	f->flags = fcntl(fd, F_GETFL);
 	known = look->depth == FILES_BEFORE ? NULL : take_known(look, f);
 	if (!known) {
-		f->name = read_name(look, number);
-		if (!f->name) {
+		if (!learn_name(look, f)) {
 			close(fd);
 			return 0;
 		}
-		f->kind = kind_of(f);
 		f->outside = is_inits(look, f);
 		if (f->kind == FILE_SOCKET)
 			file_look_at_socket(fd, f);
@@ -1122,9 +1160,12 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 	else
 		result = walk(&look, 0, err);
 	close(look.fd_dir);
-	files->served = depth == FILES_BEFORE ? mounts_may_be_served(&look.mounts)
+	files->served = depth == FILES_BEFORE ? mounts_may_be_served(&look.mounts, pid)
 					      : known && known->served;
 	mounts_free(&look.mounts);
+	if (!result && depth == FILES_BEFORE && look.refuses)
+		result = fail(err, AVC_UNSUPPORTED, 0, pid, "look at descriptors", "", "%s",
+			      look.refuses);
 	if (!result && depth != FILES_NOW &&
 	    files_find_device(files, makedev(MISC_MAJOR, FUSE_MINOR)) >= 0)
 		result = fail(err, AVC_UNSUPPORTED, 0, pid, "look at descriptors", "", "%s",
@@ -1276,6 +1317,14 @@ static struct files *look_before(const struct process *process, const struct pro
 	return files;
 }
 
+static void note_sockets(struct process *process, const struct files *files)
+{
+	process->socket_count = 0;
+	for (uint32_t i = 0; i < files->count && process->socket_count < SOCKETS_MAX; i++)
+		if (files->file[i].kind == FILE_SOCKET)
+			process->sockets[process->socket_count++] = files->file[i].fd;
+}
+
 int files_prepare(struct process *process, const struct process *parent, struct avc_error *err)
 {
 	struct files *before, *image;
@@ -1296,6 +1345,7 @@ int files_prepare(struct process *process, const struct process *parent, struct 
 	files_free(process->files_before);
 	process->files_before = before;
 	process->files_seen = before->count;
+	note_sockets(process, before);
 	image = files_new(before->count + before->count / 4 + ROOM_SPARE);
 	if (!image)
 		return fail_errno(err, process->pid, "look at descriptors", "calloc",
@@ -1363,10 +1413,6 @@ void files_settle(struct image *image)
 {
 	files_land();
 	files_find_closed(image->files, image->template);
-	file_rights_read(&image->files->rights, image->process->pid);
-	/* A child can have exited since the freeze. */
-	if (!image->files->rights.known)
-		file_rights_read(&image->files->rights, image->template);
 	for (uint32_t i = 0; i < image->files->count; i++) {
 		struct file *f = &image->files->file[i];
 		struct file now = { .fd = f->fd, .kind = FILE_REGULAR };

@@ -62,6 +62,8 @@ void files_forget(struct process *process);
 /* Why one that has /dev/fuse open cannot be protected: and whoever exits with a file of its server's
  * open waits for that. */
 extern const char files_serves[];
+/* Why a process that has a descriptor of that name cannot be protected, or NULL. */
+const char *files_refuses(const char *name);
 void files_free(struct files *files);
 /* Restores the tables of a dead app: that of the main process, which its templates hold, at once;
  * for the others it fills in image.table.  Lists what the restored processes have to do themselves.
@@ -266,6 +268,7 @@ struct file {
 	uint32_t lock_count;
 	int pipe_bytes;             /* F_GETPIPE_SZ; -1: it does not answer              */
 	bool remote;                /* a network file system: no requests while frozen */
+	uint64_t mount;             /* on which that was found; 0: not known           */
 	bool lock_unsure;           /* flock(2) may have been called just around the freeze   */
 	struct file_socket *socket; /* allocated                                   */
 	uint64_t tcp_written, tcp_taken; /* bytes, by the app                      */
@@ -487,7 +490,8 @@ struct file_rights_own {
 	int group_count;
 	uint32_t groups[RIGHTS_GROUPS];
 };
-void file_rights_read(struct file_rights *rights, pid_t pid);
+/* `status`: that process's. */
+void file_rights_note(struct file_rights *rights, pid_t pid, const struct proc_status *status);
 /* The calling thread opens files as that process would, until it switches back; nothing else may be
  * done in between. -1: it cannot, and nothing has changed. */
 int file_rights_take(const struct file_rights *rights, struct file_rights_own *own) warn_unused;

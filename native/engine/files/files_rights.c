@@ -14,26 +14,22 @@
 
 static bool same_users(pid_t pid)
 {
-	char own[64], theirs[64];
+	static char own[64]; /* a guard never leaves it */
+	char theirs[64];
 
-	return proc_link(getpid(), "ns/user", own, sizeof own) == 0 &&
+	return (*own || proc_link(getpid(), "ns/user", own, sizeof own) == 0) &&
 	       proc_link(pid, "ns/user", theirs, sizeof theirs) == 0 && !strcmp(own, theirs);
 }
 
-void file_rights_read(struct file_rights *rights, pid_t pid)
+void file_rights_note(struct file_rights *rights, pid_t pid, const struct proc_status *status)
 {
-	struct proc_status status;
-
-	rights->known = false;
-	if (proc_status(pid, &status))
-		return;
 	rights->known = true;
-	rights->user = status.uid[3];
-	rights->group = status.gid[3];
+	rights->user = status->uid[3];
+	rights->group = status->gid[3];
 	/* In a user namespace of its own they mean nothing outside. */
-	rights->caps = same_users(pid) ? status.caps[2] : 0;
-	rights->group_count = status.group_count;
-	memcpy(rights->groups, status.groups, sizeof rights->groups);
+	rights->caps = same_users(pid) ? status->caps[2] : 0;
+	rights->group_count = status->group_count;
+	memcpy(rights->groups, status->groups, sizeof rights->groups);
 }
 
 static int set_effective(uint64_t caps)

@@ -363,7 +363,7 @@ static void watch(struct avc_guard *guard, nfds_t *n, int fd)
 		struct pollfd *more = realloc(guard->fds, 2 * (*n + 32) * sizeof *more);
 
 		if (!more)
-			return; /* it is checked with the next event all the same */
+			return; /* it is checked with the next event of another one */
 		guard->fds = more;
 		guard->fds_room = 2 * (*n + 32);
 	}
@@ -432,10 +432,12 @@ static bool poll_until(struct pollfd *fds, nfds_t n, uint64_t until)
 	return any;
 }
 
-static void wait_for_news(struct avc_guard *guard, bool straggling)
+/* Whether a descriptor became ready. */
+static bool wait_for_news(struct avc_guard *guard, bool straggling)
 {
 	uint64_t due = work_due(guard);
 	nfds_t n = 0;
+	bool ready;
 
 	watch(guard, &n, guard->socket);
 	if (n && guard->outbox_count)
@@ -471,9 +473,9 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 		due = earlier(due, now + (fresh ? STRAGGLER_NS : STRAGGLER_LONG_NS));
 	}
 	/* An idle guard only wakes to beat, and to check whether a program was executed. */
-	while (!poll_until(guard->fds, n,
-			   earlier(due, earlier(now_ns() + AVC_HEARTBEAT_NS,
-						guard_exec_check_due(guard)))) &&
+	while (!(ready = poll_until(guard->fds, n,
+				    earlier(due, earlier(now_ns() + AVC_HEARTBEAT_NS,
+							 guard_exec_check_due(guard))))) &&
 	       !guard_let_executed_go(guard, false)) {
 		if (now_ns() < due)
 			continue;
@@ -484,6 +486,7 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 	for (nfds_t i = 0; i < n; i++)
 		if (guard->fds[i].revents)
 			guard_hear_exec(guard, guard->fds[i].fd);
+	return ready;
 }
 
 /* Without this, users would believe that checkpoints are taken. */
@@ -552,6 +555,7 @@ static void guard_main(struct avc_guard *guard)
 		const uint32_t straggling = guard_tend_stragglers(guard);
 		const bool dying = now_ns() < guard->dying_until_ns;
 		struct avc_report report;
+		bool news;
 
 		if (!straggling && !dying && !tracee_expects_strangers())
 			guard->stragglers_since_ns = now_ns();
@@ -562,21 +566,27 @@ static void guard_main(struct avc_guard *guard)
 		if (dying)
 			guard_reap_unknown(guard);
 		tracee_release_strangers();
-		wait_for_news(guard, straggling || dying || tracee_expects_strangers());
-		if (guard->attached && init_channel_report(&guard->channel, &report)) {
+		news = wait_for_news(guard, straggling || dying || tracee_expects_strangers());
+		if (news && guard->attached && init_channel_report(&guard->channel, &report)) {
 			guard_app_died(guard, &report);
 			continue;
 		}
-		if (guard->foreseen != guard->main.pid && pidfd_ended(guard->main.pidfd))
+		if (news && guard->foreseen != guard->main.pid && pidfd_ended(guard->main.pidfd))
 			guard_app_dies(guard);
-		guard_reap_dead(guard);
+		if (news || now_ns() >= tracee_ending_due())
+			guard_reap_dead(guard);
+		else
+			dirty_drop_ended(&guard->dirty); /* of which no descriptor is watched */
 		guard_tend_remains(guard);
-		guard_tend_tree(guard);
-		if (pidfd_ended(guard->channel.init_pidfd)) {
+		(void)guard_let_executed_go(guard, false);
+		if (news)
+			guard_let_ended_go(guard);
+		if (news && pidfd_ended(guard->channel.init_pidfd)) {
 			ended = true;
 			break;
 		}
-		carry_out(guard);
+		if (news)
+			carry_out(guard);
 		if (guard->dead.waits)
 			guard_tend_dead(guard);
 		else if (seccomp_must_suspend())

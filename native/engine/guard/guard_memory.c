@@ -37,13 +37,13 @@ static void tell(struct image *image, int value)
 
 	if (!image->template)
 		return;
-	if (image->oom_known && image->oom_told == value)
-		return;
 	if (!image->oom_known)
-		image->oom_own = proc_oom_score_adj(image->template);
+		image->oom_own = image->oom_told = proc_oom_score_adj(image->template);
+	image->oom_known = true;
 	if (value < image->oom_own)
 		value = image->oom_own;
-	image->oom_known = true;
+	if (image->oom_told == value)
+		return;
 	image->oom_told = value;
 	snprintf(text, sizeof text, "%d", value);
 	proc_set_oom_score_adj(image->template, text);

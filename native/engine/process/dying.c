@@ -31,12 +31,9 @@
  * breakpoints, or with the third sign. */
 #define PATIENCE_NS (10 * NS_PER_S)
 
-void dying_note_caught(struct process *process)
+void dying_note_caught(struct process *process, const struct proc_status *status)
 {
-	struct proc_status status;
-
-	if (proc_status(process->pid, &status) == 0)
-		process->caught |= status.caught & FATAL_SIGNALS;
+	process->caught |= status->caught & FATAL_SIGNALS;
 }
 
 void dying_begin(struct process *process)
@@ -45,7 +42,7 @@ void dying_begin(struct process *process)
 
 	process->uncaught = 0;
 	process->alive = false;
-	if (process->caught && proc_status(process->pid, &status) == 0)
+	if (process->caught && proc_status_of(process->status_fd, process->pid, &status) == 0)
 		process->uncaught = process->caught & ~status.caught;
 }
 

@@ -86,9 +86,20 @@ static int follow(struct process *process, struct avc_error *err)
 	return 0;
 }
 
+/* As proc_live_thread() has it. */
+static bool is_live(const struct process *process)
+{
+	struct proc_stat stat;
+
+	if (process->pid != process->leader)
+		return proc_live_thread(process->pid) == process->pid;
+	return proc_stat_of(process->stat_fd, &stat) == 0 && stat.state != 'Z' &&
+	       stat.state != 'X' && proc_vm_pages(process->statm_fd, NULL) > 0;
+}
+
 int process_follow(struct process *process, struct avc_error *err)
 {
-	return proc_live_thread(process->pid) == process->pid ? 0 : follow(process, err);
+	return is_live(process) ? 0 : follow(process, err);
 }
 
 void process_kill(const struct process *process)
@@ -321,6 +332,11 @@ int process_list_threads(struct process *process, struct avc_error *err)
 
 	for (uint32_t i = 0; i < process->thread_count; i++)
 		process->threads[i].seen = false;
+	if (process->thread_count == 1 && process->threads[0].tid == process->leader &&
+	    proc_thread_count(process->task_dirfd) == 1) {
+		process->threads[0].seen = true;
+		return 0;
+	}
 	if (proc_tasks(process->task_dirfd, count_task, &walk))
 		return fail_errno(err, process->pid, "walk threads", "getdents64", "it has ended");
 	if (walk.count > THREADS_MAX)

@@ -111,7 +111,7 @@ int fence_answer(struct process *process, struct thread *thread, const struct qu
 /* ---- dying.c ------------------------------------------------------------------- */
 
 /* Before a freeze: notes for which fatal signals it has handlers. */
-void dying_note_caught(struct process *process);
+void dying_note_caught(struct process *process, const struct proc_status *status);
 /* In a freeze: before its threads are checked, and when none was in a handler. */
 void dying_begin(struct process *process);
 void dying_end(struct process *process);

@@ -16,48 +16,31 @@
 
 #include "process.h"
 
-static const struct {
-	const char *prefix, *reason;
-} unsupported_fds[] = {
-	{ "anon_inode:[io_uring]", "it uses io_uring (most programs do without: "
-				   "avckpt.io_uring=off)" },
-	{ "anon_inode:[userfaultfd]", "it uses userfaultfd" },
-	{ "anon_inode:[perf_event]", "it has performance counters open" },
-	{ "/dev/nvidia", "it has a GPU device open" },
-	{ "/dev/dri/", "it has a GPU device open" },
-	{ "/dev/kfd", "it has a GPU device open" },
-	{ "/dev/kvm", "it runs virtual machines" },
-	{ "/dev/fuse", files_serves },
-};
-
-static int check_descriptors(struct process *process, struct avc_error *err)
+/* Before injection; from then on the look before each freeze (files_prepare()) does the same. */
+static int check_descriptors(const struct process *process, struct avc_error *err)
 {
 	char path[64], link[128];
 	struct dirent *entry;
-	int result = 0;
+	const char *refused = NULL;
 	DIR *dir;
 
+	if (process->infected)
+		return 0;
 	snprintf(path, sizeof path, "/proc/%d/fd", process->pid);
 	dir = opendir(path);
 	if (!dir)
 		return fail_errno(err, process->pid, "check", "open(fd)", "it has ended");
-	process->socket_count = 0;
-	while (!result && (entry = readdir(dir))) {
+	while (!refused && (entry = readdir(dir))) {
 		ssize_t n = readlinkat(dirfd(dir), entry->d_name, link, sizeof link - 1);
 
 		if (n <= 0)
 			continue;
 		link[n] = 0;
-		if (!strncmp(link, "socket:", 7) && process->socket_count < SOCKETS_MAX)
-			process->sockets[process->socket_count++] = atoi(entry->d_name);
-		for (size_t i = 0; i < sizeof unsupported_fds / sizeof *unsupported_fds; i++)
-			if (!strncmp(link, unsupported_fds[i].prefix,
-				     strlen(unsupported_fds[i].prefix)))
-				result = fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "",
-					      "%s", unsupported_fds[i].reason);
+		refused = files_refuses(link);
 	}
 	closedir(dir);
-	return result;
+	return refused ? fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "", "%s", refused)
+		       : 0;
 }
 
 static int check_mapping(const struct mapping *m, void *arg)
@@ -130,15 +113,10 @@ static int check_descendant(const struct process *process, const struct proc_sta
 
 /* The shadow stack would not match the calls made in the parasite, and the thread would fault on
  * return: so before injection.  A program has it from its start, or not at all. */
-static int check_shadow_stack(struct process *process, struct avc_error *err)
+static int check_shadow_stack(const struct process *process, const struct proc_status *status,
+			      struct avc_error *err)
 {
-	struct proc_status status;
-
-	if (process->infected)
-		return 0;
-	if (proc_status(process->pid, &status))
-		return fail_errno(err, process->pid, "check", "open(status)", "it has ended");
-	if (status.shadow_stack)
+	if (!process->infected && status->shadow_stack)
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "",
 			    "it has shadow stacks (CET), which cannot be put back; "
 			    "GLIBC_TUNABLES=glibc.cpu.x86_shstk=off runs it without");
@@ -217,13 +195,13 @@ int support_check(struct process *process, struct avc_error *err)
 {
 	struct proc_status status;
 
-	if (check_word_size(process, err) || check_shadow_stack(process, err) ||
+	if (proc_status_of(process->status_fd, process->pid, &status))
+		return fail_errno(err, process->pid, "check", "open(status)", "it has ended");
+	if (check_word_size(process, err) || check_shadow_stack(process, &status, err) ||
 	    check_namespaces(process, err) || check_descriptors(process, err) ||
 	    check_mappings(process, err))
 		return -1;
-	dying_note_caught(process);
-	if (proc_status(process->pid, &status))
-		return fail_errno(err, process->pid, "check", "open(status)", "it has ended");
+	dying_note_caught(process, &status);
 	(void)seccomp_is_containers(&status, process->plain_filters);
 	note_filters(process, status.seccomp_filters);
 	return process->descendant ? check_descendant(process, &status, err) : 0;
@@ -267,7 +245,13 @@ static bool is_in_message(const struct process *process)
 bool process_is_quiescent(const struct process *process)
 {
 	pid_t pid = process->pid;
+	struct proc_stat stat;
 
-	return proc_tasks(process->task_dirfd, is_awake, &pid) == 0 &&
-	       !(process->tcp_messages && is_in_message(process));
+	if (proc_stat_of(process->stat_fd, &stat) == 0 && stat.threads == 1) {
+		if (stat.state == 'R')
+			return false;
+	} else if (proc_tasks(process->task_dirfd, is_awake, &pid)) {
+		return false;
+	}
+	return !(process->tcp_messages && is_in_message(process));
 }

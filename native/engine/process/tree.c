@@ -148,19 +148,12 @@ static int is_none(struct tree *tree, pid_t pid, struct avc_error *err)
 static int look_at_task(pid_t tid, void *arg)
 {
 	const struct looking *look = arg;
-	struct tree *tree = look->tree;
 	pid_t children[CHILDREN_MAX];
 	const int count = proc_children_of(look->task_dirfd, tid, children, CHILDREN_MAX);
 
-	for (int i = 0; i < count; i++) {
-		const int none = look->parent == PARENT_INIT ? is_none(tree, children[i], look->err)
-							     : 0;
-
-		if (none < 0)
+	for (int i = 0; i < count; i++)
+		if (add_entry(look->tree, children[i], look->parent, look->err))
 			return -1;
-		if (!none && add_entry(tree, children[i], look->parent, look->err))
-			return -1;
-	}
 	return 0;
 }
 
@@ -172,15 +165,19 @@ static int look_below(struct tree *tree, int task_dirfd, int parent, struct avc_
 	return proc_tasks(task_dirfd, look_at_task, &look) && err->code ? -1 : 0;
 }
 
+/* It has one thread. */
 static int look_below_init(struct tree *tree, struct avc_error *err)
 {
-	int task_dirfd = proc_open(tree->init, "task", O_RDONLY | O_DIRECTORY), result;
+	pid_t children[CHILDREN_MAX];
+	const int count = proc_children(tree->init, children, CHILDREN_MAX);
 
-	if (task_dirfd < 0)
-		return 0;
-	result = look_below(tree, task_dirfd, PARENT_INIT, err);
-	close(task_dirfd);
-	return result;
+	for (int i = 0; i < count; i++) {
+		const int none = is_none(tree, children[i], err);
+
+		if (none < 0 || (!none && add_entry(tree, children[i], PARENT_INIT, err)))
+			return -1;
+	}
+	return 0;
 }
 
 /* A zombie; not a main thread that has exited before its threads. */

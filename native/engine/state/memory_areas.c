@@ -383,12 +383,13 @@ static int check_layout(const struct image *image, struct avc_error *err)
 	const uint64_t start = now_ns();
 	int result;
 
-	if (proc_mappings(image->template, "maps", hash_mapping, &survey))
-		return fail_errno(err, image->template, "keep memory", "read(maps)",
-				  "it was killed");
-	if (survey.layout == memory->layout &&
-	    start - memory->read_ns < memory->cost_ns * SMAPS_SHARE)
-		return 0;
+	if (memory->layout && start - memory->read_ns < memory->cost_ns * SMAPS_SHARE) {
+		if (proc_mappings(image->template, "maps", hash_mapping, &survey))
+			return fail_errno(err, image->template, "keep memory", "read(maps)",
+					  "it was killed");
+		if (survey.layout == memory->layout)
+			return 0;
+	}
 	survey = (struct survey){
 		.process = process,
 		.template = image->template,

@@ -146,7 +146,7 @@ int pending_read(struct process *process, struct avc_error *err)
 		    read_queue(pending, t->tid, t->block, err))
 			return -1;
 	}
-	if (pending->count && !proc_status(process->pid, &status)) {
+	if (pending->count && !proc_status_of(process->status_fd, process->pid, &status)) {
 		assign(process, &status);
 		pending->deadly = find_deadly(process, &status);
 		pending->caught = pending->deadly && status.caught & SIGNAL_BIT(pending->deadly);

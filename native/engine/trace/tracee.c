@@ -372,6 +372,7 @@ void tracee_kill(pid_t pid)
 /* The app has just been stopped, and goes first: freeing memory keeps a CPU from it for as long as
  * the kernel does not reschedule. */
 #define END_AFTER_NS (10 * NS_PER_MS)
+#define END_TOGETHER_NS NS_PER_MS /* ends those at once that are to end within it */
 
 static __thread struct {
 	struct {
@@ -413,7 +414,7 @@ uint32_t tracee_reap_ending(void)
 {
 	uint32_t left = 0;
 
-	end_until(now_ns());
+	end_until(now_ns() + END_TOGETHER_NS);
 	for (uint32_t i = 0; i < ending.count; i++) {
 		int status;
 		const pid_t r = waitpid(ending.task[i].pid, &status,
