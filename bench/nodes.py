@@ -7,12 +7,12 @@ Every node (tests/victims/crash.c) beats a thousand times a second.  It is kille
 outside, or faults, aborts or exits by itself.  What counts is the gap between two beats of the one
 that was killed, and of its siblings; theirs is compared with as many windows without a kill, in
 which the sidecar is asked as often.  Of each longest gap it is told for how long that node was
-runnable and got no CPU in the whole window (schedstat).  With --idle nothing is killed: what the
-nodes cost is measured for that time.
+runnable and got no CPU in the whole window (schedstat).  With --idle nothing is killed, and nodes
+sleep: what protecting them costs is measured for that time.
 
 Needs root, Podman and what `make setup` builds; roslaunch needs scripts/setup-ros.sh, supervisord
-PyPI's supervisor.  Takes the machine's sidecar and hooks for itself, as the tests do.  Prints a
-table and writes bench/results/nodes.json.
+PyPI's supervisor.  Sidecar and hooks are its own, beside those of the machine.  Prints a table and
+writes bench/results/nodes.json.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from avckpt.cli.client import Client
 from avckpt.supervision.pressure import held_bytes, templates_of
 from rich.console import Console
 
@@ -42,20 +41,19 @@ from testkit.board import Board
 from testkit.harness import (
     BASE_IMAGE,
     ROOT,
-    RUN_DIR,
-    SIDECAR_NAME,
     Container,
     ContainerFactory,
     Podman,
-    machine_lock,
-    running_sidecar,
     wait_until,
 )
+from testkit.local_sidecar import LocalSidecar, hooked_podman, local_sidecar
 from testkit.nodes import SUPERVISORD, SUPERVISORD_CONF, app_pid, supervisor_options
 
 RESULTS = ROOT / "bench/results/nodes.json"
 WITHIN_MS = 20.0
 HOPELESS_S = 10.0
+SETTLE_S = 10.0
+"""Before costs are measured: avckpt.interval=auto finds its pace."""
 PAUSE_S = (0.1, 0.3)
 """Between two kills: there is a checkpoint of every node in it."""
 
@@ -64,6 +62,7 @@ SIGNALS = (
     *("SIGUSR1", "SIGUSR2", "SIGHUP"),  # by itself: a fault, abort(), exit(3)
 )
 NODE = "#!/bin/sh\nexec /victims/crash --board /bench/$NODE.board\n"
+IDLE = "#!/bin/sh\nexec sleep infinity\n"
 SHELL = """
 for i in {numbers}; do NODE=$i $AVCKPT_INIT --name n$i -- /bench/nodes/node & done
 while wait -n; s=$?; [ $s != 127 ]; do echo ended $s; done
@@ -124,18 +123,24 @@ class Idle:
 class Nodes:
     """The container, and a board for each node."""
 
-    def __init__(self, container: Container, boards: dict[str, Board]) -> None:
-        self.container, self.boards = container, boards
+    def __init__(self, sidecar: LocalSidecar, container: Container, boards: dict[str, Board]) -> None:
+        self.sidecar, self.container, self.boards = sidecar, container, boards
 
     def rows(self) -> dict[str, dict[str, Any]]:
         """By name.  Asked directly: the command line takes seconds on a busy machine."""
-        rows = Client(RUN_DIR).containers(memory=False)
+        rows = self.sidecar.client.containers(memory=False)
         return {row["name"].partition("/")[2]: row for row in rows if row["node_of"] == self.container.id}
 
-    def wait_protected(self) -> dict[str, dict[str, Any]]:
+    def wait_protected(self, *, fully: bool = True) -> dict[str, dict[str, Any]]:
+        """Fully: with all generations that they keep."""
+
         def found() -> dict[str, dict[str, Any]]:
             rows = self.rows()
-            ready = [row for row in rows.values() if row["state"] == "protected" and row["generations"] == row["keep"]]
+            ready = [
+                row
+                for row in rows.values()
+                if row["state"] == "protected" and (row["generations"] == row["keep"] or not fully)
+            ]
             return rows if len(ready) == len(self.boards) else {}
 
         return wait_until(found, 120, f"{len(self.boards)} nodes are protected", every_s=0.5)
@@ -153,12 +158,14 @@ def run_delay_ms(pid: int) -> float:
     return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e6
 
 
-def start(factory: ContainerFactory, folder: Path, stack: ExitStack, options: argparse.Namespace) -> Nodes:
+def start(sidecar: LocalSidecar, folder: Path, stack: ExitStack, options: argparse.Namespace) -> Nodes:
+    factory = ContainerFactory(hooked_podman(sidecar), f"avckpt-nodes-{os.getpid()}")
+    stack.callback(factory.close)
     numbers = range(1, options.nodes + 1)
     boards = {f"n{n}": stack.enter_context(Board(folder / f"{n}.board")) for n in numbers}
     package = folder / "nodes"
     package.mkdir()
-    (package / "node").write_text(NODE)
+    (package / "node").write_text(IDLE if options.idle else NODE)
     (package / "node").chmod(0o755)
     (package / "package.xml").write_text(PACKAGE)
     (package / "all.launch").write_text(
@@ -178,7 +185,7 @@ def start(factory: ContainerFactory, folder: Path, stack: ExitStack, options: ar
     if options.interval:
         labels["interval"] = options.interval
     container = factory.protected(*command, labels=labels, image=image, options=[*volumes, *others])
-    return Nodes(container, boards)
+    return Nodes(sidecar, container, boards)
 
 
 def ros_image(podman: Podman) -> str:
@@ -268,16 +275,17 @@ def run(nodes: Nodes, options: argparse.Namespace) -> Result:
 
 
 def idle(nodes: Nodes, options: argparse.Namespace) -> Idle:
-    rows = nodes.wait_protected().values()
-    main_pid = int(nodes.container.podman.inspect(SIDECAR_NAME)["State"]["Pid"])
-    own, guards = processes(main_pid)
+    rows = nodes.wait_protected(fully=False).values()
+    time.sleep(SETTLE_S)
+    assert nodes.sidecar.process is not None
+    own, guards = processes(nodes.sidecar.process.pid)
     before, guards_before, began = cpu_s(own), cpu_s(guards), time.monotonic()
     time.sleep(options.idle)
     took = time.monotonic() - began
     return Idle(
         nodes=options.nodes,
         seconds=round(took, 1),
-        interval_s=max(row["interval_s"] for row in rows),
+        interval_s=round(statistics.median(row["interval_s"] for row in nodes.rows().values()), 3),
         guards_cpu_percent=round(100 * (cpu_s(guards) - guards_before) / took, 2),
         sidecar_cpu_percent=round(100 * (cpu_s(own) - before) / took, 2),
         guards_pss_mb=pss_mb(guards),
@@ -297,15 +305,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     subprocess.run(["make", "-s", "-C", str(VICTIMS.parent), "STATIC=1"], check=True)
-    podman = Podman()
-    factory = ContainerFactory(podman, f"avckpt-nodes-{os.getpid()}")
     with ExitStack() as stack:
-        stack.enter_context(machine_lock(timeout_s=600))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="avckpt-nodes-")))
         folder.chmod(0o777)
-        stack.enter_context(running_sidecar(podman))
-        stack.callback(factory.close)
-        nodes = start(factory, folder, stack, options)
+        sidecar = stack.enter_context(local_sidecar(folder))
+        sidecar.start()
+        nodes = start(sidecar, folder, stack, options)
         result = idle(nodes, options) if options.idle else run(nodes, options)
     console.print()
     for key, value in asdict(result).items():

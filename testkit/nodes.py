@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from testkit.harness import Container, Sidecar
+from testkit.local_sidecar import LocalSidecar
 from testkit.procfs import children_of, inside
 
 SUPERVISORD = ("python3", "-m", "supervisor.supervisord", "-c")
@@ -24,7 +25,7 @@ def supervisor_options() -> list[str]:
     return ["-v", f"{library}:/lib/supervisor/supervisor:ro", "-e", "PYTHONPATH=/lib/supervisor"]
 
 
-def nodes_of(sidecar: Sidecar, container: Container) -> dict[str, dict[str, Any]]:
+def nodes_of(sidecar: Sidecar | LocalSidecar, container: Container) -> dict[str, dict[str, Any]]:
     """By their names, as `avckpt ps` has them."""
     return {
         row["name"].partition("/")[2]: row
