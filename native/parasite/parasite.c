@@ -10,6 +10,7 @@
 #include <linux/mman.h>
 #include <linux/prctl.h>
 #include <linux/sched.h>
+#include <stdbool.h>
 
 #include "syscall.h"
 
@@ -21,7 +22,8 @@
 	raw_syscall(nr, (uint64_t)(a), (uint64_t)(b), (uint64_t)(c), (uint64_t)(d), 0, 0)
 
 #define __WALL_ 0x40000000 /* <linux/wait.h> */
-#define PAUSE_WAITS 1000
+#define PAUSE_US 50
+#define PAUSE_SHARE 16 /* it may end so much later than it could, as a part of it */
 #define SPAWN_TRIES 4000
 #define SPAWN_TRIES_AT_ONCE 8
 #define SPAWN_PAUSE_US 100
@@ -61,11 +63,16 @@ static long futex_wait(uint32_t *word, uint32_t value, int64_t ms)
 /* Sleeps for a while (< 0: forever). By ppoll(2), because it has no restart block: a timed futex
  * wait or a nanosleep that the tracer interrupts would overwrite the one that the borrowed thread's
  * call still needs. */
+static void park_us(int64_t us)
+{
+	struct inj_timespec t = { us / 1000000, us % 1000000 * 1000 };
+
+	raw_syscall(__NR_ppoll, 0, 0, us < 0 ? 0 : (uint64_t)&t, 0, 8, 0);
+}
+
 static void park(int64_t ms)
 {
-	struct inj_timespec t = { ms / 1000, ms % 1000 * 1000000 };
-
-	raw_syscall(__NR_ppoll, 0, 0, ms < 0 ? 0 : (uint64_t)&t, 0, 8, 0);
+	park_us(ms < 0 ? ms : ms * 1000);
 }
 
 static void pause_us(int64_t us)
@@ -135,20 +142,26 @@ static long change_caps(uint64_t option, uint64_t set)
 	return 0;
 }
 
-/* No tracer interrupts it meanwhile: see park(). */
-static void make_pause(struct inj_call *call)
+/* A tracer can interrupt it: not ours, but the next one when ours has died.  So it sleeps as park()
+ * does.  Without a tracer its filters may refuse that call, with any error.  False: no tracer has
+ * ended it. */
+static bool make_pause(struct inj_call *call)
 {
 	__atomic_store_n(&call->pause, INJ_PAUSED, __ATOMIC_RELEASE);
 	futex_wake(&call->pause);
-	/* Without a tracer its filters may refuse this call, with any error. */
-	for (int i = 0; i < PAUSE_WAITS; i++)
-		if (__atomic_load_n(&call->pause, __ATOMIC_ACQUIRE) != INJ_PAUSED ||
-		    futex_wait(&call->pause, INJ_PAUSED, call->park_ms) == -110 /* ETIMEDOUT */)
-			return;
+	for (uint64_t us = 0, step; us < call->park_ms * UINT64_C(1000); us += step) {
+		if (__atomic_load_n(&call->pause, __ATOMIC_ACQUIRE) != INJ_PAUSED)
+			return true;
+		step = us / PAUSE_SHARE > PAUSE_US ? us / PAUSE_SHARE : PAUSE_US;
+		park_us((int64_t)step);
+	}
+	return false;
 }
 
 __attribute__((section(".text.entry"))) void inj_run(uint64_t result, struct inj_call *call)
 {
+	bool alone = false;
+
 	(void)result;
 	for (uint32_t i = 0; i < call->count && i < INJ_CALLS_MAX; i++) {
 		struct inj_syscall *s = &call->call[i];
@@ -161,7 +174,7 @@ __attribute__((section(".text.entry"))) void inj_run(uint64_t result, struct inj
 							  __WALL_, 0, 0, 0)
 					    : 0;
 		else if (s->nr == INJ_PAUSE)
-			make_pause(call);
+			alone = !make_pause(call);
 		else if (s->nr == INJ_FUTURE_LOCK)
 			s->result = find_future_lock();
 		else if (s->nr == INJ_CAPS)
@@ -180,7 +193,7 @@ __attribute__((section(".text.entry"))) void inj_run(uint64_t result, struct inj
 	/* The tracer now stops this task and sends it back. If there is no tracer any more, a
 	 * thread of the app returns by itself. */
 	if (call->after == INJ_AFTER_HOME) {
-		park(call->park_ms);
+		park(alone ? 0 : call->park_ms);
 		make_list(call->will, call->wills < INJ_WILLS_MAX ? call->wills : INJ_WILLS_MAX);
 		inj_go_home();
 	}

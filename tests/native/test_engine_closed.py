@@ -68,7 +68,7 @@ def test_a_table_that_it_leaves(where: str, tmp_path: Path) -> None:
 
         wait_until(only_one_has_it, PATIENCE_S, "it has it open")
         for _ in range(2):
-            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            assert guard.checkpoint()["kind"] == "checkpoint"
         assert init.popen.stdin is not None
         init.popen.stdin.write(b"x")
         init.popen.stdin.flush()

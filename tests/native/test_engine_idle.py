@@ -44,7 +44,7 @@ def test_it_sleeps(tmp_path: Path) -> None:
     """A guard sleeps between checkpoints, also that of a process tree."""
     for command in ("idle 1 2 --beat-us 1000", "tree 3"):
         with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
-            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            assert guard.checkpoint()["kind"] == "checkpoint"
             time.sleep(1)  # its spare
             before = wake_ups(guard.pid)
             time.sleep(SLEEPS_S)
@@ -58,7 +58,7 @@ def exec_until_closed_s(fifo: Path) -> float:
     command = [sys.executable, "-S", "-c", EXECUTES, str(fifo)]
     with Init(command, pid1=True, stdin=subprocess.PIPE) as init, GuardProcess(config(), [init.pid]) as guard:
         wait_until(lambda: has_open(app_pid(init.pid), fifo), PATIENCE_S, "it has it open")
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         time.sleep(1.7)  # looks around would be 200 ms apart by now
         began = time.monotonic()
         assert init.popen.stdin is not None

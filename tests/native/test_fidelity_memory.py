@@ -17,6 +17,9 @@ import pytest
 from testkit.guarded import WHERE, GuardProcess, Json, Victim, config, kill_at_random
 from testkit.harness import wait_until
 
+GUARDS_AT_ONCE = 60
+"""Each is killed, and the next one comes at once."""
+
 
 @pytest.fixture(autouse=True)
 def built(init_built: None, victims_built: Path) -> None:
@@ -111,6 +114,18 @@ def test_it_stays_so_if_the_guard_dies(where: str, tmp_path: Path) -> None:
                 guard.kill_guards()
                 wait_until(lambda: uninherited(victim) == before, 5, "it is inherited no more")
                 guard.start_another(victim.pid)
+        victim.wait_beats()
+
+
+def test_the_next_guard_cuts_no_nap_short(tmp_path: Path) -> None:
+    """It interrupts a thread that waits for a guard that has died: what the thread slept in before is not forgotten."""
+    rng = random.Random(3)
+    with Victim("mappings 0 --in-child", tmp_path) as victim, GuardProcess(config(0.002), [victim.pid]) as guard:
+        for _ in range(GUARDS_AT_ONCE):
+            guard.wait("checkpoint", since=guard.mark())
+            time.sleep(rng.uniform(0.0, 0.005))
+            guard.start_another(victim.pid)
+        guard.wait("checkpoint", since=guard.mark())
         victim.wait_beats()
 
 

@@ -211,7 +211,7 @@ def test_a_table_that_two_children_share_and_their_parent_does_not(tmp_path: Pat
 def test_of_one_thread_and_not_for_long(tmp_path: Path) -> None:
     """One checkpoint is missed, and the generations stay valid."""
     with Victim("unsupported network signal 2", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         victim.kill_app(signal.SIGUSR1)
         wait_until(lambda: victim.see().counter[0] == 1, 5, "a thread is in a network of its own")
         answer = guard.command("checkpoint")

@@ -71,7 +71,7 @@ def test_nobody_is_killed_for_what_a_template_holds(group: MemoryGroup, tmp_path
     ):
         app = victim.app
         for n in range(1, 4):
-            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            assert guard.checkpoint()["kind"] == "checkpoint"
             os.kill(app, signal.SIGUSR1)
             assert guard.wait("dropped", count=n)["reason"] == "killed"
             wait_until(lambda n=n: victim.see().counter[0] == 140 * n, 10, "it has written all of it")  # type: ignore[misc]
@@ -87,7 +87,7 @@ def test_older_generations_go_first(group: MemoryGroup, tmp_path: Path) -> None:
     ):
         app = victim.app
         for n in range(1, 4):
-            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            assert guard.checkpoint()["kind"] == "checkpoint"
             os.kill(app, signal.SIGUSR1)
             wait_until(lambda n=n: victim.see().counter[0] == 80 * n, 10, "it has written all of it")  # type: ignore[misc]
         dropped = guard.wait("dropped")

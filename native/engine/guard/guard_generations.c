@@ -424,6 +424,9 @@ void guard_reap_dead(struct avc_guard *guard)
 		dirty_drop_ended(&guard->dirty);
 		if (!count || (poll_for(news, 2, NS_PER_MS) > 0 && news[0].revents))
 			return;
+		/* init waits for all of our tracees, too. */
+		(void)guard_tend_stragglers(guard);
+		guard_reap_unknown(guard);
 		if (news[1].revents & POLLIN)
 			break;
 		if (news[1].revents)

@@ -325,7 +325,6 @@ int parasite_finish(pid_t tid, struct inj_call *call, struct avc_error *err)
 int parasite_run_on(pid_t tid, struct inj_call *call, struct avc_error *err)
 {
 	__atomic_store_n(&call->pause, INJ_PAUSE_OVER, __ATOMIC_RELEASE);
-	syscall(SYS_futex, &call->pause, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
 	return parasite_finish(tid, call, err);
 }
 
