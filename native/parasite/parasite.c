@@ -187,7 +187,7 @@ __attribute__((section(".text.entry"))) void inj_run(uint64_t result, struct inj
 						s->arg[4], s->arg[5]);
 	}
 	__atomic_store_n(&call->done, 1, __ATOMIC_RELEASE);
-	if (call->after == INJ_AFTER_HOME && !call->park_ms)
+	if (call->after == INJ_AFTER_HOME && !call->park_ms && !call->wills)
 		inj_go_home(); /* nobody waits for it: parasite_cut_short() */
 	futex_wake(&call->done);
 	/* The tracer now stops this task and sends it back. If there is no tracer any more, a
