@@ -83,7 +83,7 @@ def test_it_is_used_up_and_made_again(tmp_path: Path) -> None:
             assert ours(victim, "avckpt-tmpl") == template
         # Only the newest generation has one.
         assert guard.checkpoint()["kind"] == "checkpoint"
-        wait_until(lambda: ours(victim, "avckpt-tmpl") not in (template, []), 5, "another template")
+        wait_until(lambda: ours(victim, "avckpt-tmpl") not in (template, []), PATIENCE_S, "another template")
         wait_spare(victim, other_than=spare)
 
 
@@ -92,7 +92,7 @@ def test_killed_it_is_no_loss(tmp_path: Path) -> None:
     with Victim("threads 4 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         taken = guard.checkpoint()
         os.kill(wait_spare(victim), signal.SIGKILL)
-        wait_until(lambda: not spares(victim), 5, "it is gone")
+        wait_until(lambda: not spares(victim), PATIENCE_S, "it is gone")
         since = guard.mark()
         victim.kill_app()
         assert guard.wait("restored", since=since)["generation"] == taken["generation"]
@@ -205,7 +205,7 @@ def limited(processes: int, victim: str = "idle 0 4") -> Iterator[tuple[Victim, 
         forks = config(keep=1, images=Images.FORK)
         with Victim(command, Path(folder)) as made, GuardProcess(forks, [made.pid]) as guard:
             yield made, guard
-        wait_until(lambda: not processes_of(54322), 5, "nobody is left who counts with the next ones")
+        wait_until(lambda: not processes_of(54322), PATIENCE_S, "nobody is left who counts with the next ones")
 
 
 def test_none_when_it_may_not_have_another_process() -> None:
@@ -271,7 +271,9 @@ def test_priorities_are_kept(tmp_path: Path) -> None:
         for _ in range(3):
             assert guard.checkpoint()["kind"] == "checkpoint"
             wait_spare(victim)
-            wait_until(lambda: policies(victim, "avckpt-spare") == {os.SCHED_FIFO}, 5, "the spare has it again")
+            wait_until(
+                lambda: policies(victim, "avckpt-spare") == {os.SCHED_FIFO}, PATIENCE_S, "the spare has it again"
+            )
             assert policies(victim, "avckpt-tmpl") == {os.SCHED_FIFO}
             for _ in range(2):
                 die_and_come_back(victim, guard)
@@ -288,7 +290,9 @@ def inside(cgroup: Cgroup, command: str, folder: Path) -> Iterator[tuple[Victim,
         cgroup.take(victim.app)
         yield victim, guard
         victim.check()
-        wait_until(lambda: len(spares(victim)) == 1 and len(ours(victim)) == 3, 5, "template, spare, holder, no more")
+        wait_until(
+            lambda: len(spares(victim)) == 1 and len(ours(victim)) == 3, PATIENCE_S, "template, spare, holder, no more"
+        )
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -320,13 +324,13 @@ def test_made_late_it_is_used(tmp_path: Path) -> None:
         shared = False
         for _ in range(10):
             guard.checkpoint()
-            wait_until(lambda: len(ours(victim)) == 2, 5, "holder and template")
+            wait_until(lambda: len(ours(victim)) == 2, PATIENCE_S, "holder and template")
             (template,) = ours(victim, "avckpt-tmpl")
             pause.wait()
             time.sleep(0.8)
             assert not spares(victim), "it was made before the pause"
             pause.go()
-            wait_until(lambda: len(ours(victim)) == 3, 5, "it is there")
+            wait_until(lambda: len(ours(victim)) == 3, PATIENCE_S, "it is there")
             (late,) = {*ours(victim, "avckpt-tmpl"), *spares(victim)} - {template}
             since = guard.mark()
             victim.kill_app()
@@ -394,7 +398,7 @@ def test_its_template_is_killed_in_the_making(slow: Callable[[], Cgroup], tmp_pa
             time.sleep(rng.choice([0.0, 0.1]))
             cgroup.go()
             guard.wait("dropped", since=since)
-            wait_until(lambda: len(ours(victim)) == 1, 5, "the holder alone")
+            wait_until(lambda: len(ours(victim)) == 1, PATIENCE_S, "the holder alone")
             victim.wait_beats(5)
         guard.checkpoint()
 
@@ -414,4 +418,4 @@ def test_the_guard_stops_in_the_making(slow: Callable[[], Cgroup], tmp_path: Pat
             guard.stop()
             later.join()
         victim.wait_beats(5)
-        wait_until(lambda: not ours(victim), 5, "nothing of ours is left")
+        wait_until(lambda: not ours(victim), PATIENCE_S, "nothing of ours is left")
