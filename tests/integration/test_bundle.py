@@ -7,27 +7,15 @@ import json
 import os
 import signal
 import stat
-import tarfile
 from pathlib import Path
 
 import pytest
 
+from testkit.bundles import read_bundle
 from testkit.harness import ContainerFactory, Sidecar, wait_until
 from testkit.protected import told
 
 SECRET = "a-secret-of-the-application"
-
-
-def read(path: Path) -> dict[str, str]:
-    with tarfile.open(path) as archive:
-        members = archive.getmembers()
-        assert len({member.name.partition("/")[0] for member in members}) == 1
-        found = {}
-        for member in members:
-            file = archive.extractfile(member)
-            assert file is not None
-            found[member.name.partition("/")[2]] = file.read().decode("utf-8", "surrogateescape")
-        return found
 
 
 @pytest.mark.shared_machine("a restore on a busy machine may take longer than the test waits")
@@ -46,7 +34,7 @@ def test_all_that_is_known_of_a_container(sidecar: Sidecar, container: Container
     said = sidecar.avckpt("bundle", crashing.name, "-o", str(path))
     assert said.stdout == f"{path}\n"
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    found = read(path)
+    found = read_bundle(path)
     kinds = [json.loads(line)["kind"] for line in found["events.jsonl"].splitlines()]
     assert "died" in kinds
     assert "restored" in kinds
@@ -65,7 +53,8 @@ def test_all_that_is_known_of_a_container(sidecar: Sidecar, container: Container
     assert ("config.yaml" in found) != ("config.yaml" in found.get("missing.txt", ""))
     with_core = tmp_path / "core.tar.gz"
     sidecar.avckpt("bundle", crashing.name, "-o", str(with_core), "--core")
-    assert read(with_core)["core.zst"].encode("utf-8", "surrogateescape")[:4] == bytes.fromhex("28b52ffd")  # of zstd
+    zstd = bytes.fromhex("28b52ffd")
+    assert read_bundle(with_core)["core.zst"].encode("utf-8", "surrogateescape")[:4] == zstd
 
     # Of the first of two crashes.
     sidecar.wait_generation(crashing)
@@ -78,7 +67,7 @@ def test_all_that_is_known_of_a_container(sidecar: Sidecar, container: Container
     assert line.endswith(crash["message"])
     first = tmp_path / "first.tar.gz"
     sidecar.avckpt("bundle", str(crash["seq"]), "-o", str(first), "--core")
-    found = read(first)
+    found = read_bundle(first)
     assert json.loads(found["event.json"]) == crash
     assert "it has started" in found["container.log"]
     assert "restored in" in found["sidecar.log"]

@@ -7,12 +7,12 @@ import os
 import signal
 import subprocess
 import sys
-import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from testkit.bundles import read_bundle
 from testkit.harness import avckpt_command, run, wait_until
 from testkit.local_sidecar import QUICK, LocalSidecar, local_sidecar
 
@@ -45,14 +45,6 @@ def sidecar(tmp_path: Path) -> Iterator[LocalSidecar]:
             journald.kill()
 
 
-def read(path: Path, name: str) -> str:
-    with tarfile.open(path) as archive:
-        [member] = [member for member in archive.getmembers() if member.name.endswith(f"/{name}")]
-        file = archive.extractfile(member)
-        assert file is not None
-        return file.read().decode()
-
-
 def test_a_bundle_has_what_the_journal_says_of_it(sidecar: LocalSidecar, tmp_path: Path) -> None:
     crashing, other = (sidecar.protected(name, NAP, QUICK) for name in ("crashing", "other"))
     for each in (crashing, other):
@@ -65,7 +57,7 @@ def test_a_bundle_has_what_the_journal_says_of_it(sidecar: LocalSidecar, tmp_pat
         path = tmp_path / "bundle.tar.gz"
         path.unlink(missing_ok=True)
         run([*sidecar.command, "bundle", what, "-o", str(path)], env=sidecar.env)
-        return read(path, "journal.txt")
+        return read_bundle(path)["journal.txt"]
 
     wait_until(lambda: "restored in" in bundle("crashing"), 20, "the restore is told")
     journal = bundle("crashing")

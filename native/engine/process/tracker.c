@@ -64,12 +64,15 @@ static int make_task(struct process *process, pid_t *child, struct arch_regs *ba
 	return tracee_settle(process->holder, err);
 }
 
-static bool is_userfaultfd(int fd)
+/* -1, and it is closed: it is none. */
+static int only_userfaultfd(int fd)
 {
 	char name[32] = "";
 
-	return readlink(fd_path(fd).text, name, sizeof name - 1) > 0 &&
-	       !strcmp(name, "anon_inode:[userfaultfd]");
+	if (fd >= 0 && (readlink(fd_path(fd).text, name, sizeof name - 1) <= 0 ||
+			strcmp(name, "anon_inode:[userfaultfd]")))
+		close_fd(&fd);
+	return fd;
 }
 
 /* Number 0 of an unshared table. */
@@ -95,13 +98,11 @@ static int open_in(struct process *process, pid_t child, const struct arch_regs 
 		return fail(err, AVC_UNSUPPORTED, (int)-made->result, child, "watch memory",
 			    "userfaultfd", "the kernel does not allow it");
 	pidfd = proc_pidfd_open(child);
-	fd = pidfd < 0 ? -1 : proc_borrow_fd(pidfd, 0);
+	fd = only_userfaultfd(pidfd < 0 ? -1 : proc_borrow_fd(pidfd, 0));
 	close_fd(&pidfd);
-	if (fd >= 0 && is_userfaultfd(fd))
-		return fd;
-	close_fd(&fd);
-	return fail(err, AVC_DEADLINE, 0, child, "watch memory", "pidfd_getfd",
-		    "no userfaultfd was made");
+	return fd >= 0 ? fd
+		       : fail(err, AVC_DEADLINE, 0, child, "watch memory", "pidfd_getfd",
+			      "no userfaultfd was made");
 }
 
 /* By the watcher.  Between two tracers, and without one if both die, it waits for a while in a table
@@ -127,15 +128,13 @@ static int open_by_watcher(struct process *process, pid_t child, const struct ar
 		return -1;
 	pidfd = proc_pidfd_open(child);
 	if (pidfd >= 0 && ptrace(PTRACE_DETACH, child, NULL, NULL) == 0) {
-		fd = watcher_open(child, pidfd);
+		fd = only_userfaultfd(watcher_open(child, pidfd));
 		syscall(SYS_pidfd_send_signal, pidfd, SIGKILL, NULL, 0);
 	}
 	close_fd(&pidfd);
-	if (fd >= 0 && is_userfaultfd(fd))
-		return fd;
-	close_fd(&fd);
-	return fail(err, AVC_UNSUPPORTED, 0, child, "watch memory", "userfaultfd",
-		    "it was not made in time, or the kernel does not allow it");
+	return fd >= 0 ? fd
+		       : fail(err, AVC_UNSUPPORTED, 0, child, "watch memory", "userfaultfd",
+			      "it was not made in time, or the kernel does not allow it");
 }
 
 static int open_uffd(struct process *process, struct avc_error *err)
