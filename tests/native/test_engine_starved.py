@@ -177,11 +177,13 @@ def in_the_stub(event: dict[str, object]) -> bool:
     return event.get("kind") == "missed" and "infect: it did not get to run in time" in str(event)
 
 
-def test_the_filters_of_a_late_one_do_it_no_harm(tmp_path: Path) -> None:
-    """Its own refuse the calls of the first injected instructions, where a guard has left it."""
+@pytest.mark.parametrize("command", ["sandbox", "steady"])
+def test_who_is_late_in_the_stub_gets_home(command: str, tmp_path: Path) -> None:
+    """Though its filters refuse the calls of the first injected instructions, or a signal comes every millisecond:
+    not only its handler runs."""
     with (
         throttle() as slow,
-        Victim("sandbox", tmp_path) as victim,
+        Victim(command, tmp_path) as victim,
         subprocess.Popen([sys.executable, "-c", "while True: pass"]) as other,
     ):
         try:

@@ -40,6 +40,7 @@
 
 #define NS_PER_MS UINT64_C(1000000)
 #define NS_PER_S UINT64_C(1000000000)
+#define SIGNAL_BIT(signal) (UINT64_C(1) << ((signal)-1))
 #define CHILDREN_MAX 4096 /* of init: orphans, holders and templates, too   */
 
 #define warn_unused __attribute__((warn_unused_result))

@@ -418,18 +418,18 @@ static uint64_t work_due(struct avc_guard *guard)
 	return earlier(due, tracee_ending_pidfd(0) < 0 ? guard->ahead_ns : tracee_ending_due());
 }
 
-/* Whether a descriptor became ready. */
-static bool poll_until(struct pollfd *fds, nfds_t n, uint64_t until)
+/* How many descriptors became ready; -1: a tracee has stopped, for which a straggling guard waits, too. */
+static int poll_until(struct pollfd *fds, nfds_t n, uint64_t until, bool straggling)
 {
 	const uint64_t now = now_ns();
 	const struct timespec timeout = timespec_of(until > now ? until - now : 0);
-	bool any;
+	int ready;
 
 	heartbeat_rest(until);
-	any = ppoll(fds, n, &timeout, NULL) != 0;
+	ready = straggling ? tracee_poll(fds, n, &timeout) : ppoll(fds, n, &timeout, NULL);
 	heartbeat_rest(0);
 	heartbeat();
-	return any;
+	return ready;
 }
 
 /* Whether a descriptor became ready. */
@@ -437,7 +437,7 @@ static bool wait_for_news(struct avc_guard *guard, bool straggling)
 {
 	uint64_t due = work_due(guard);
 	nfds_t n = 0;
-	bool ready;
+	int ready;
 
 	watch(guard, &n, guard->socket);
 	if (n && guard->outbox_count)
@@ -475,7 +475,8 @@ static bool wait_for_news(struct avc_guard *guard, bool straggling)
 	/* An idle guard only wakes to beat, and to check whether a program was executed. */
 	while (!(ready = poll_until(guard->fds, n,
 				    earlier(due, earlier(now_ns() + AVC_HEARTBEAT_NS,
-							 guard_exec_check_due(guard))))) &&
+							 guard_exec_check_due(guard))),
+				    straggling)) &&
 	       !guard_let_executed_go(guard, false)) {
 		if (now_ns() < due)
 			continue;
@@ -486,7 +487,7 @@ static bool wait_for_news(struct avc_guard *guard, bool straggling)
 	for (nfds_t i = 0; i < n; i++)
 		if (guard->fds[i].revents)
 			guard_hear_exec(guard, guard->fds[i].fd);
-	return ready;
+	return ready > 0;
 }
 
 /* Without this, users would believe that checkpoints are taken. */

@@ -78,7 +78,6 @@ uint32_t image_table_owner(const struct image *image, uint32_t index);
 struct image *image_find(struct image *image, uint32_t images, const struct process *process);
 
 /* Signals typical of crashes. */
-#define SIGNAL_BIT(signal) (UINT64_C(1) << ((signal)-1))
 #define FATAL_SIGNALS                                                                         \
 	(SIGNAL_BIT(SIGSEGV) | SIGNAL_BIT(SIGBUS) | SIGNAL_BIT(SIGFPE) | SIGNAL_BIT(SIGILL) | \
 	 SIGNAL_BIT(SIGABRT) | SIGNAL_BIT(SIGTRAP) | SIGNAL_BIT(SIGSYS))

@@ -272,11 +272,35 @@ static bool is_in_stub(const struct thread *thread, const struct arch_regs *now)
 	       arch_pc(now) - thread->stub < ARCH_STUB_BYTES;
 }
 
+/* The last call of the stub takes the thread's own signal mask back.  From then on a signal that comes
+ * again and again has its handler run, instead of the rest of the stub. */
+static bool has_own_mask(pid_t tid)
+{
+	const uint64_t unblockable = SIGNAL_BIT(SIGKILL) | SIGNAL_BIT(SIGSTOP);
+	uint64_t mask;
+
+	return ptrace(PTRACE_GETSIGMASK, tid, sizeof mask, &mask) == 0 &&
+	       (mask | unblockable) != ~UINT64_C(0);
+}
+
 /* From where it can be given back: it has no porter.  Otherwise it still has to reap that. */
 static bool has_no_porter(const struct thread *thread, const struct arch_regs *now)
 {
 	return arch_pc(now) == thread->stub ||
-	       (arch_syscall_nr(now) == SYS_clone && arch_syscall_result(now) < 0);
+	       (arch_syscall_nr(now) == SYS_clone && arch_syscall_result(now) < 0) ||
+	       has_own_mask(thread->tid);
+}
+
+/* In the middle of its calls it may still have to restore something (MADV_DONTFORK), or to reap a task
+ * that it created for us, which the app would find.  Let go in the stub, it would make them under the
+ * app's filters. */
+static bool must_go_on(const struct process *process, const struct thread *thread,
+		       const struct arch_regs *now)
+{
+	if (is_in_stub(thread, now))
+		return !has_no_porter(thread, now);
+	return thread->borrowed && parasite_contains(&process->parasite, arch_pc(now)) &&
+	       !has_made_calls(process);
 }
 
 /* What a thread has created that was no longer waited for. */
@@ -344,7 +368,8 @@ static bool straggle(struct process *process, struct thread *thread)
 	case STOP_SYSCALL:
 		/* Registers cannot be changed at this stop: let it reach another one.  A clone that
 		 * is interrupted where it begins is begun again (ERESTARTNOINTR), and again. */
-		if (!tracee_enters_call(tid))
+		if (!tracee_enters_call(tid) &&
+		    (arch_regs_get(tid, &now) || !must_go_on(process, thread, &now)))
 			ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
 		seccomp_go_on(tid, &stop);
 		return true;
@@ -352,20 +377,12 @@ static bool straggle(struct process *process, struct thread *thread)
 		break;
 	}
 	if (arch_regs_get(tid, &now) == 0) {
-		/* Not in the middle of its calls: it may still have to restore something
-		 * (MADV_DONTFORK), or to reap a task that it created for us, which the app would
-		 * find. */
-		const bool in_stub = is_in_stub(thread, &now);
-		const bool in_parasite = thread->borrowed &&
-					 parasite_contains(&process->parasite, arch_pc(&now));
-
-		/* Let go in the stub, it would make its calls under the app's filters. */
-		if ((in_parasite && !has_made_calls(process)) ||
-		    (in_stub && !has_no_porter(thread, &now))) {
+		if (must_go_on(process, thread, &now)) {
 			seccomp_go_on(tid, &stop);
 			return true;
 		}
-		if (in_parasite || in_stub) {
+		if (is_in_stub(thread, &now) ||
+		    (thread->borrowed && parasite_contains(&process->parasite, arch_pc(&now)))) {
 			thread_give_back(thread, &ignored);
 		} else {
 			if (thread->borrowed && thread->borrowed_for)

@@ -16,6 +16,7 @@
 #ifndef AVCKPT_TRACE_H
 #define AVCKPT_TRACE_H
 
+#include <poll.h>
 #include <sys/socket.h>
 #include <sys/uio.h>
 
@@ -277,6 +278,8 @@ struct process {
  * does nothing else. */
 int tracee_timer_signal(void);
 int tracee_timer_new(timer_t *timer, struct avc_error *err) warn_unused;
+/* ppoll(2), which ends with EINTR, too, as soon as a tracee has stopped or ended, even before the call. */
+int tracee_poll(struct pollfd *fds, nfds_t n, const struct timespec *timeout);
 void tracee_deadline_set(timer_t timer, uint64_t ns);
 void tracee_deadline_clear(timer_t timer);
 bool tracee_deadline_passed(void);

@@ -36,11 +36,22 @@ int tracee_timer_signal(void)
 	return SIGRTMAX - 2;
 }
 
-static void install_handler(void)
+static void install_handlers(void)
 {
 	struct sigaction action = { .sa_handler = nothing }; /* no SA_RESTART: wait(2) ends */
 
 	sigaction(tracee_timer_signal(), &action, NULL);
+	sigaction(SIGCHLD, &action, NULL);
+}
+
+int tracee_poll(struct pollfd *fds, nfds_t n, const struct timespec *timeout)
+{
+	sigset_t blocked;
+
+	sigfillset(&blocked);
+	sigdelset(&blocked, tracee_timer_signal());
+	sigdelset(&blocked, SIGCHLD);
+	return ppoll(fds, n, timeout, &blocked);
 }
 
 int tracee_timer_new(timer_t *timer, struct avc_error *err)
@@ -50,7 +61,7 @@ int tracee_timer_new(timer_t *timer, struct avc_error *err)
 				  .sigev_signo = tracee_timer_signal() };
 	sigset_t set;
 
-	pthread_once(&once, install_handler);
+	pthread_once(&once, install_handlers);
 	sigfillset(&set);
 	sigdelset(&set, tracee_timer_signal());
 	pthread_sigmask(SIG_SETMASK, &set, NULL);
