@@ -103,7 +103,7 @@ test-aarch64: build-aarch64 ## the engine's tests on Debian 12 for aarch64, in a
 build-tests: setup-build
 	@$(MAKE) -s -j2 -C native
 	@$(MAKE) -s -j2 -C native SANITIZE=1
-	@$(MAKE) -s -j2 -C native STORES=1
+	@$(MAKE) -s -j2 -C native STEPS=1
 	@$(MAKE) -s -j2 -C tests/victims
 	@$(MAKE) -s -C tests/victims STATIC=1 build-static/intruder
 	@$(MAKE) -s -C tests/fuzz SEEDS=1
@@ -165,7 +165,7 @@ campaign: setup ## inject faults into protected containers in C++, Python, Go an
 	@$(VENV)/python -m bench.campaign_show
 
 clean: ## remove what was built here (images and the base's cache stay)
-	rm -rf build .venv native/build native/build-san native/build-fuzz native/build-stores tests/fuzz/build tests/fuzz/build-seeds .pytest_cache .mypy_cache .ruff_cache
+	rm -rf build .venv native/build native/build-san native/build-fuzz native/build-steps tests/fuzz/build tests/fuzz/build-seeds .pytest_cache .mypy_cache .ruff_cache
 	rm -rf tests/victims/build sidecar/avckpt/_native.c sidecar/avckpt/_native*.so *.egg-info
 	find hooks sidecar native tests testkit scripts examples bench -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null; true
 

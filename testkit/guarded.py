@@ -407,12 +407,12 @@ WHERE = ("", "--in-child")
 """What a test of a victim is done with: the main process does everything, or a child of it."""
 
 
-def storm(guard_config: GuardConfig, kills: int, max_ms: float, seed: int, *victims: Victim) -> dict[str, object]:
+def storm(guard_config: GuardConfig, kills: int, reach: float, seed: int, *victims: Victim) -> dict[str, object]:
     """Runs kill_storm.py; what it says at the end."""
     fields = {**dataclasses.asdict(guard_config), "restore_on_statuses": []}
     done = subprocess.run(
         [
-            *(sys.executable, "-m", "testkit.kill_storm", json.dumps(fields), str(kills), str(max_ms), str(seed)),
+            *(sys.executable, "-m", "testkit.kill_storm", json.dumps(fields), str(kills), str(reach), str(seed)),
             *(str(victim.pid) for victim in victims),
         ],
         capture_output=True,

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kills guards at random moments, again and again.
 
-    python -m testkit.kill_storm CONFIG KILLS MAX_MS SEED INIT_PID...
+    python -m testkit.kill_storm CONFIG KILLS REACH SEED INIT_PID...
 
-Each round starts a guard for every init, and kills them with SIGKILL up to MAX_MS ms later.
-Prints one line of JSON at the end: what was hit, and what was left behind in the containers.
+Each round starts a guard for every init, and kills them with SIGKILL up to REACH times later than they take, here and
+now, until one has taken a checkpoint.  Prints one line of JSON at the end: what was hit, and what was left behind in
+the containers.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import os
 import random
 import select
 import signal
+import statistics
 import sys
 import time
 from collections import Counter
@@ -28,6 +30,7 @@ from testkit.procfs import children_of
 
 KINDS = (Kind.ATTACHED, Kind.CHECKPOINT, Kind.MISSED, Kind.UNPROTECTED)
 LEAVE_S = 3.0
+MEASURED = 5
 
 
 def ours_below(init: int) -> list[str]:
@@ -53,40 +56,64 @@ def wait_gone(inits: list[int]) -> list[str]:
         time.sleep(0.001)
 
 
-def round_of_guards(engine: Engine, guard_config: GuardConfig, inits: list[int], patience_s: float) -> Counter[Kind]:
-    """Guards of all of them, killed after some time; what they said until then."""
-    guards = []
+def round_of_guards(
+    engine: Engine, guard_config: GuardConfig, inits: list[int], patience_s: float | None = None
+) -> tuple[Counter[Kind], float]:
+    """Guards of all of them, killed after some time, or when one has taken a checkpoint.
+
+    Returns what they said, and how long they were there.
+    """
+    guards, began = [], time.monotonic()
     for cookie, pid in enumerate(inits, 1):
         pidfd = os.pidfd_open(pid)
         guards.append(engine.start_guard(pidfd, guard_config, cookie))
         os.close(pidfd)
-    time.sleep(patience_s)
-    for guard in guards:
-        os.kill(guard.pid, signal.SIGKILL)  # our children, not reaped yet
     seen: Counter[Kind] = Counter()
-    while seen[Kind.GUARD_LOST] < len(guards):
+
+    def listen() -> None:
         select.select([engine.event_fd], [], [], 10.0)
         while (event := engine.next_event()) is not None:
             seen[event.kind] += 1
             if event.kind is Kind.UNPROTECTED:
                 print(event, file=sys.stderr, flush=True)
+
+    if patience_s is None:
+        while not seen[Kind.CHECKPOINT]:
+            listen()
+    else:
+        time.sleep(patience_s)
+    lived_s = time.monotonic() - began
+    for guard in guards:
+        os.kill(guard.pid, signal.SIGKILL)  # our children, not reaped yet
+    while seen[Kind.GUARD_LOST] < len(guards):
+        listen()
     for guard in guards:
         guard.stop()
-    return seen
+    return seen, lived_s
+
+
+def first_checkpoints_s(engine: Engine, guard_config: GuardConfig, inits: list[int]) -> float:
+    """How long they take until one of them has one."""
+    took = []
+    for _ in range(MEASURED):
+        took.append(round_of_guards(engine, guard_config, inits)[1])
+        wait_gone(inits)
+    return statistics.median(took)
 
 
 def main() -> None:
     """See above."""
     guard_config = config_of_json(sys.argv[1])
-    kills, max_ms, seed = int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
+    kills, reach, seed = int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
     inits = [int(pid) for pid in sys.argv[5:]]
     rng = random.Random(seed)
     totals: Counter[Kind] = Counter()
     hit = 0
     left: list[str] = []
     with Engine() as engine:
+        longest_s = reach * first_checkpoints_s(engine, guard_config, inits)
         for _ in range(kills):
-            seen = round_of_guards(engine, guard_config, inits, rng.uniform(0.0, max_ms) / 1000)
+            seen, _ = round_of_guards(engine, guard_config, inits, rng.uniform(0.0, longest_s))
             totals += seen
             hit += seen[Kind.CHECKPOINT] > 0
             left += wait_gone(inits)

@@ -219,7 +219,7 @@ def test_nothing_is_left_of_guards_that_die_as_they_begin_to_watch(tmp_path: Pat
     """For a moment the task that opens the userfaultfd has no tracer."""
     rng, watchers = random.Random(7), 0
     with (
-        Victim("busy 3", tmp_path, preexec=seccomp.refusing("userfaultfd")) as victim,
+        Victim("idle 10 4", tmp_path, preexec=seccomp.refusing("userfaultfd")) as victim,
         GuardProcess(config(0.02, images=Images.DIRTY), [victim.pid]) as guard,
     ):
         copied_since(guard, 0)

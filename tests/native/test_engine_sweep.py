@@ -8,7 +8,6 @@ AVCKPT_SWEEP names.
 
 from __future__ import annotations
 
-import contextlib
 import mmap
 import os
 import re
@@ -17,22 +16,15 @@ import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import pytest
 from avckpt.guard import Images
 
-from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config, injected
+from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config
 from testkit.harness import ROOT, wait_until
 from testkit.procfs import status_of
 
-CHANGES = ",".join(
-    (
-        *("ptrace", "process_vm_writev", "pwrite64", "write", "setsockopt", "ioctl", "fcntl", "epoll_ctl"),
-        *("kill", "tgkill", "pidfd_send_signal", "sendmsg", "clone", "execveat", "prlimit64"),
-        *("sched_setscheduler", "sched_setattr", "mmap", "munmap", "close"),
-    )
-)
 MOST = 40000
 """System calls or stores of one checkpoint or restore; there are never so many."""
 MISSES = 100
@@ -43,7 +35,7 @@ SWEEP = os.environ.get("AVCKPT_SWEEP") or str(int(time.time()) // 3600)
 """Which part: "all", or a number."""
 PART = 1 if SWEEP == "all" else 16
 FIRST = 1 if SWEEP == "all" else 1 + int(SWEEP) % PART
-STORES = ROOT / "native/build-stores/avckpt-guard"
+COUNTING = ROOT / "native/build-steps/avckpt-guard"
 
 pytestmark = [
     pytest.mark.timeout(7200 if PART == 1 else 600),
@@ -63,53 +55,34 @@ def numbers() -> Iterator[int]:
     yield from range(FIRST, MOST, PART)
 
 
-class Death(Protocol):
-    """Kills a guard before the `nth` thing that it does from arm() on."""
+class Death:
+    """Kills a guard before the `nth` thing that it does from arm() on: a system call that may change something, or a
+    store to memory shared with the application and init.  Such a guard counts them (steps.c)."""
 
-    def arm(self, guard: GuardProcess, nth: int) -> None: ...
-
-    def disarm(self) -> None: ...
-
-
-class CallDeath:
-    """By strace, before a system call."""
-
-    def arm(self, guard: GuardProcess, nth: int) -> None:
-        self.injected = contextlib.ExitStack()
-        self.injected.enter_context(injected(guard, CHANGES, f"signal=KILL:when={nth}"))
-
-    def disarm(self) -> None:
-        self.injected.close()
-
-
-class StoreDeath:
-    """By a guard that counts its stores to memory shared with the application and init (stores.c)."""
-
-    def __init__(self, path: Path, patch: pytest.MonkeyPatch) -> None:
-        subprocess.run(["make", "-s", "-C", str(ROOT / "native"), "STORES=1"], check=True, timeout=300)
-        path.write_bytes(bytes(8))
+    def __init__(self, of: str, path: Path, patch: pytest.MonkeyPatch) -> None:
+        subprocess.run(["make", "-s", "-C", str(ROOT / "native"), "STEPS=1"], check=True, timeout=300)
+        path.write_bytes(bytes(16))
         with path.open("r+b") as file:
-            self.left = mmap.mmap(file.fileno(), 8)
-        patch.setenv("AVCKPT_STORES", str(path))
-        patch.setenv("AVCKPT_TEST_GUARD", str(STORES))
+            self.left = mmap.mmap(file.fileno(), 16)
+        self.at = 8 * ["calls", "stores"].index(of)
+        patch.setenv("AVCKPT_STEPS", str(path))
+        patch.setenv("AVCKPT_TEST_GUARD", str(COUNTING))
 
-    def arm(self, guard: GuardProcess, nth: int) -> None:
-        self.left[:] = struct.pack("q", nth)
+    def arm(self, nth: int) -> None:
+        struct.pack_into("q", self.left, self.at, nth)
 
     def disarm(self) -> None:
-        self.left[:] = bytes(8)
+        self.arm(0)
 
 
 @pytest.fixture(params=["calls", "stores"])
 def death(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Death:
-    if request.param == "stores":
-        return StoreDeath(tmp_path / "stores", monkeypatch)
-    return CallDeath()
+    return Death(request.param, tmp_path / "steps", monkeypatch)
 
 
 def answer(guard: GuardProcess, death: Death, nth: int, command: str) -> dict[str, Any]:
     """The command's answer, or that the guard was killed before it had carried it out."""
-    death.arm(guard, nth)
+    death.arm(nth)
     try:
         since = guard.mark()
         ticket = guard.say_command(command)

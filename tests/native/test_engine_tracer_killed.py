@@ -39,7 +39,7 @@ def test_no_application_notices(tmp_path: Path) -> None:
         victims = [stack.enter_context(Victim(command, tmp_path)) for command in ("threads 6 4", "fpu 2", "signals 4")]
         names = [threads(victim.app) for victim in victims[1:]]
         pids = [victim.app for victim in victims]
-        said = storm(config(0.002), KILLS, 40, 1, *victims)
+        said = storm(config(0.002), KILLS, 2, 1, *victims)
         assert said["kills"] == KILLS
         assert said["left"] == []
         assert said["unprotected"] == 0
@@ -69,7 +69,7 @@ def test_blocked_calls_go_on(tmp_path: Path) -> None:
     its error (512) to the socket's next call, which fails with it: this is an error in the kernel.
     """
     with Victim("eintr all 0", tmp_path) as victim, Victim("signals 4 --pending", tmp_path) as signals:
-        said = storm(config(0.002), 60, 40, 2, victim, signals)
+        said = storm(config(0.002), 60, 2, 2, victim, signals)
         assert said["left"] == []
         signals.wait_beats(20)
         calls = victim.see().counter[8 : 8 + KINDS]
@@ -86,8 +86,8 @@ def test_blocked_calls_go_on(tmp_path: Path) -> None:
 def test_memory_of_dead_guards_is_given_back(tmp_path: Path) -> None:
     """Each guard maps pages into the application; its successor unmaps them."""
     with Victim("threads 4 1", tmp_path) as victim:
-        storm(config(0.002), 20, 40, 3, victim)
-        storm(config(0.002), 200, 12, 3, victim)  # many of them while they map theirs
+        storm(config(0.002), 20, 2, 3, victim)
+        storm(config(0.002), 200, 0.6, 3, victim)  # many of them while they map theirs
         with GuardProcess(config(0.02), [victim.pid]) as guard:
             guard.wait("checkpoint", count=6)
             wait_until(lambda: parasites(victim.app) <= 2, 5, "old parasites go")

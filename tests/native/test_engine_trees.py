@@ -373,7 +373,7 @@ def test_no_process_notices_that_its_tracer_was_killed(tmp_path: Path) -> None:
         commands = ("tree 8 --threads 2 --usual-waits", "churn 4", "churn 3 --vfork", "terminal")
         victims = [stack.enter_context(Victim(command, tmp_path)) for command in commands]
         before = [places(victim) for victim in victims]
-        said = storm(config(0.002), STORM, 60, 1, *victims)
+        said = storm(config(0.002), STORM, 2, 1, *victims)
         assert said["left"] == []
         assert said["unprotected"] == 0
         for victim in victims:
