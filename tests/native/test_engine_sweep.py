@@ -33,12 +33,12 @@ TIDY = 10
 """After so many guards that have died in their first checkpoint one may take two."""
 SWEEP = os.environ.get("AVCKPT_SWEEP") or str(int(time.time()) // 3600)
 """Which part: "all", or a number."""
-PART = 1 if SWEEP == "all" else 16
-FIRST = 1 if SWEEP == "all" else 1 + int(SWEEP) % PART
+CELLS = "under harmless cells"
+"""Seven processes, most of them under filters of their own, which take thousands of calls."""
 COUNTING = ROOT / "native/build-steps/avckpt-guard"
 
 pytestmark = [
-    pytest.mark.timeout(7200 if PART == 1 else 600),
+    pytest.mark.timeout(7200 if SWEEP == "all" else 600),
     pytest.mark.shared_machine(
         "a guard is killed before each of its steps, hundreds of times, and each next one has to protect in time"
     ),
@@ -50,9 +50,12 @@ def built(init_built: None, victims_built: Path) -> None:
     """avckpt-init and the victims."""
 
 
-def numbers() -> Iterator[int]:
+def numbers(command: str) -> Iterator[int]:
     """The numbers of the calls before which the guard is killed."""
-    yield from range(FIRST, MOST, PART)
+    if SWEEP == "all":
+        return iter(range(1, MOST))
+    step = 64 if command == CELLS else 8
+    return iter(range(1 + int(SWEEP) % step, MOST, step))
 
 
 class Death:
@@ -93,14 +96,12 @@ def answer(guard: GuardProcess, death: Death, nth: int, command: str) -> dict[st
         death.disarm()
 
 
-VICTIMS: tuple[str, ...] = ("steady", "steady --in-child", "peeker", "peeker --in-child", "signals 3")
-VICTIMS += ("under barren steady",)  # its filter refuses what injected code calls without its guard
-RESTORED: tuple[str, ...] = ("steady", "steady --in-child")
+BARREN = "under barren steady"
+"""Its filter refuses what injected code calls without its guard."""
+VICTIMS = ("steady", "steady --in-child", "peeker", "peeker --in-child", "signals 3", BARREN, CELLS)
+RESTORED = ("steady", "steady --in-child", CELLS)
 REFUSED = ("under no-sigprocmask idle 1 1", "sandbox --kill", "unsupported strict")
 """Under filters by which a dead guard could do harm."""
-if PART == 1:  # seven processes, most of them under filters of their own: too long for a part
-    VICTIMS += ("under harmless cells",)
-    RESTORED += ("under harmless cells",)
 TREES = ("--in-child", "cells")
 WAYS = {
     "first": (Images.FORK, 0),
@@ -124,7 +125,7 @@ def test_checkpoint(tmp_path: Path, command: str, way: str, death: Death) -> Non
         GuardProcess(config(images=images), [victim.pid]) as guard,
     ):
         guard.wait("attached")
-        for nth in numbers():
+        for nth in numbers(command):
             for _ in range(MISSES):
                 for _ in range(before):
                     protects(guard)
@@ -154,7 +155,7 @@ def test_refused(tmp_path: Path, command: str, death: Death) -> None:
     with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         guard.wait("attached")
         blocked = status_of(victim.app)["SigBlk"]
-        for nth in numbers():
+        for nth in numbers(command):
             kind = answer(guard, death, nth, "checkpoint")["kind"]
             victim.wait_beats(3)
             guard.start_another(victim.pid)
@@ -207,7 +208,7 @@ def test_restore(tmp_path: Path, command: str, way: str, death: Death) -> None:
     if images is Images.DIRTY and any(tree in command for tree in TREES):
         pytest.skip("trees are forked")
     with Victim(command, tmp_path) as first, GuardProcess(config(images=images), [first.pid]) as guard:
-        for nth in numbers():
+        for nth in numbers(command):
             with Victim(command, tmp_path) as victim:
                 guard.start_another(victim.pid)
                 for _ in range(before):

@@ -278,8 +278,18 @@ struct proc_sched {
 /* -1: not available, or it has exited. */
 int proc_sched(pid_t tid, struct proc_sched *sched);
 
-/* The relevant fields of /proc/PID/status. */
 #define STATUS_GROUPS 64
+/* Sets of capabilities. */
+enum {
+	STATUS_INHERITABLE,
+	STATUS_PERMITTED,
+	STATUS_EFFECTIVE,
+	STATUS_BOUNDING,
+	STATUS_AMBIENT,
+	STATUS_CAPS
+};
+
+/* The relevant fields of /proc/PID/status. */
 struct proc_status {
 	int64_t locked_kb; /* -1: it has no memory any more */
 	pid_t inside;      /* in the innermost PID namespace                   */
@@ -293,7 +303,7 @@ struct proc_status {
 	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
 	int group_count;         /* supplementary; further ones are not known */
 	uint32_t groups[STATUS_GROUPS];
-	uint64_t caps[5]; /* inheritable, permitted, effective, bounding, ambient */
+	uint64_t caps[STATUS_CAPS];
 	uint32_t no_new_privs, seccomp, seccomp_filters;
 	bool shadow_stack; /* x86: CET                                        */
 };

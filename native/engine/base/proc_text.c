@@ -227,8 +227,8 @@ static void parse_groups(const char *p, struct proc_status *status)
 /* Which of the above the line has. */
 static uint32_t parse_status_line(const char *line, size_t length, struct proc_status *status)
 {
-	static const char *const caps[5] = { "CapInh:", "CapPrm:", "CapEff:", "CapBnd:",
-					     "CapAmb:" };
+	static const char *const caps[STATUS_CAPS] = { "CapInh:", "CapPrm:", "CapEff:", "CapBnd:",
+						       "CapAmb:" };
 	const char *value = memchr(line, '\t', length), *last;
 
 	if (!value)
@@ -258,7 +258,7 @@ static uint32_t parse_status_line(const char *line, size_t length, struct proc_s
 		return parse_ids(value, status->uid) ? HAS_UID : 0;
 	if (!strncmp(line, "Gid:", 4))
 		return parse_ids(value, status->gid) ? HAS_GID : 0;
-	for (int i = 0; i < 5; i++)
+	for (int i = 0; i < STATUS_CAPS; i++)
 		if (!strncmp(line, caps[i], 7)) {
 			status->caps[i] = strtoull(value, NULL, 16);
 			return (uint32_t)HAS_CAPS << i;

@@ -48,20 +48,22 @@ int generation_new(struct generation *generation, struct process *main, uint32_t
 }
 
 /* A fork of the main thread has its attributes of that instant, except for what fork(2) resets. */
-static int hear_template(struct process *process, struct thread *cloned,
+static int hear_template(const struct image *image, struct thread *cloned,
 			 const struct inj_call *call, const struct inj_syscall *attributes,
 			 struct avc_error *err)
 {
 	const struct creds was = cloned->creds;
 
-	attributes_answer(attributes, call->out + TEMPLATE_ATTRIBUTES, &cloned->creds);
+	if (attributes_answer(image->template, attributes, call->out + TEMPLATE_ATTRIBUTES,
+			      &cloned->creds, err))
+		return -1;
 	cloned->creds.death_signal = was.death_signal;
 	cloned->creds.subreaper = was.subreaper;
 	cloned->creds.slack_ns = was.slack_ns;
 	cloned->creds.filters = was.filters;
 	cloned->creds.future_lock = was.future_lock;
 	memcpy(cloned->altstack, call->out + TEMPLATE_ALTSTACK, sizeof cloned->altstack);
-	return thread_ask_others(process, cloned, &was, err);
+	return thread_ask_others(image->process, cloned, &was, err);
 }
 
 /* For a later update instead of another fork. */
@@ -112,9 +114,8 @@ static int quieten(struct image *image, struct avc_error *err)
 	if (cloned) {
 		call_add(call, SYS_sigaltstack, 0,
 			 parasite_remote(&process->parasite, call->out + TEMPLATE_ALTSTACK));
-		attributes = attributes_ask(call, call->out + TEMPLATE_ATTRIBUTES,
-					    parasite_remote(&process->parasite,
-							    call->out + TEMPLATE_ATTRIBUTES));
+		attributes = attributes_ask(&process->parasite, call,
+					    call->out + TEMPLATE_ATTRIBUTES);
 	}
 	/* Otherwise the kernel would write to its memory each time it runs, and to its clones'. A
 	 * holder's clone is not registered (kernel/rseq.c, CLONE_VM). */
@@ -130,7 +131,7 @@ static int quieten(struct image *image, struct avc_error *err)
 		return fail(err, AVC_KERNEL, (int)-rseq->result, pid, "keep template", "rseq",
 			    "refused");
 	image->dumpable = dumpable->result;
-	if (attributes && hear_template(process, cloned, call, attributes, err))
+	if (attributes && hear_template(image, cloned, call, attributes, err))
 		return -1;
 	return process->tracker ? keep_inherited(image, err) : 0;
 }

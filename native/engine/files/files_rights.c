@@ -27,7 +27,7 @@ void file_rights_note(struct file_rights *rights, pid_t pid, const struct proc_s
 	rights->user = status->uid[3];
 	rights->group = status->gid[3];
 	/* In a user namespace of its own they mean nothing outside. */
-	rights->caps = same_users(pid) ? status->caps[2] : 0;
+	rights->caps = same_users(pid) ? status->caps[STATUS_EFFECTIVE] : 0;
 	rights->group_count = status->group_count;
 	memcpy(rights->groups, status->groups, sizeof rights->groups);
 }

@@ -16,9 +16,6 @@
 
 #include "process.h"
 
-#define PERMITTED 1 /* struct proc_status, caps                                */
-#define BOUNDING 3
-
 void fence_ask(const struct process *process, struct inj_call *call, avc_remote out,
 	       struct questions *questions)
 {
@@ -42,8 +39,8 @@ static bool has_the_right(const struct process *process, const struct thread *th
 	for (int i = 0; i < 3; i++)
 		if (other.uid[i] != own.uid[0] || other.gid[i] != own.gid[0])
 			return false;
-	return !(other.caps[PERMITTED] & ~own.caps[PERMITTED]) &&
-	       (own.no_new_privs || own.caps[BOUNDING] >> CAP_SYS_ADMIN & 1);
+	return !(other.caps[STATUS_PERMITTED] & ~own.caps[STATUS_PERMITTED]) &&
+	       (own.no_new_privs || own.caps[STATUS_BOUNDING] >> CAP_SYS_ADMIN & 1);
 }
 
 /* The main process may have entered one since its holder was made: that is made again, once. */

@@ -223,7 +223,7 @@ void thread_ask_add(const struct process *process, bool with_locks, struct inj_c
 	inside = call_add(call, SYS_gettid);
 	name = call_add(call, SYS_prctl, PR_GET_NAME, out + 32);
 	locks = with_locks ? call_add(call, INJ_FUTURE_LOCK) : NULL;
-	attributes = attributes_ask(call, call->out + 64, out + 64);
+	attributes = attributes_ask(&process->parasite, call, call->out + 64);
 	*questions = (struct questions){ tid_address, altstack,   inside, name,
 					 locks,       attributes, NULL,   NULL };
 	_Static_assert(64 + ATTRIBUTES_ASK_BYTES + 16 <= sizeof call->out, "room for the answers");
@@ -276,7 +276,9 @@ int thread_ask_answer(struct process *process, struct thread *thread, const stru
 	thread->inside = (pid_t)inside->result;
 	memcpy(thread->name, call->out + 32, sizeof thread->name);
 	thread->name[sizeof thread->name - 1] = 0;
-	attributes_answer(questions->attributes, call->out + 64, &thread->creds);
+	if (attributes_answer(thread->tid, questions->attributes, call->out + 64, &thread->creds,
+			      err))
+		return -1;
 	if (locks && locks->result > 0)
 		thread->creds.future_lock = (int32_t)locks->result;
 	if (fence_answer(process, thread, questions, err))

@@ -71,9 +71,22 @@ void attributes_read_scheduling(pid_t tid, struct scheduling *s)
 	s->io_priority = (int32_t)syscall(SYS_ioprio_get, IOPRIO_WHO_PROCESS, tid);
 }
 
-/* `out`, `remote`: room for ATTRIBUTES_ASK_BYTES. */
-const struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_remote remote)
+/* A supervised task would stop twice for each capability that there is: /proc is read instead. */
+static void ask_caps(const struct parasite *parasite, struct inj_call *call, avc_remote others)
 {
+	if (parasite->seccomp == SECCOMP_SUPERVISED) {
+		call_add(call, INJ_LIST); /* an empty one */
+		call_add(call, INJ_LIST);
+	} else {
+		call_add(call, INJ_CAPS, PR_CAPBSET_READ);
+		call_add(call, INJ_CAPS, PR_CAP_AMBIENT, others);
+	}
+}
+
+const struct inj_syscall *attributes_ask(const struct parasite *parasite, struct inj_call *call,
+					 void *out)
+{
+	const avc_remote remote = parasite_remote(parasite, out);
 	struct answers *a = out;
 	const struct inj_syscall *first;
 
@@ -89,8 +102,7 @@ const struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_r
 	call_add(call, SYS_get_mempolicy, AT(memory_policy), AT(nodes), NODE_BITS);
 	call_add(call, SYS_personality, 0xffffffff);
 	call_add(call, SYS_capget, AT(header), AT(caps));
-	call_add(call, INJ_CAPS, PR_CAPBSET_READ);
-	call_add(call, INJ_CAPS, PR_CAP_AMBIENT, AT(caps));
+	ask_caps(parasite, call, AT(caps));
 	call_add(call, ARCH_STATE_CALL, ARCH_STATE_PERMITTED, AT(state_permitted));
 	call_add(call, SYS_getgroups, GROUPS_KEPT, AT(group));
 	call_add(call, SYS_getresuid, AT(uid), AT(uid) + 4, AT(uid) + 8);
@@ -101,17 +113,22 @@ const struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_r
 	return first;
 }
 
-void attributes_answer(const struct inj_syscall *first, const void *out, struct creds *c)
+int attributes_answer(pid_t tid, const struct inj_syscall *first, const void *out, struct creds *c,
+		      struct avc_error *err)
 {
 	const struct answers *a = out;
+	const bool has_caps = first[BOUNDING].nr == INJ_CAPS;
+	struct proc_status status;
 
 	_Static_assert(sizeof *a <= ATTRIBUTES_ASK_BYTES, "room for the answers");
+	if (!has_caps && proc_status(tid, &status))
+		return fail_errno(err, tid, "read state", "read(status)", "it has ended");
 	memset(c, 0, sizeof *c); /* compared by memcmp() */
 	memcpy(c->uid, a->uid, sizeof a->uid);
 	memcpy(c->gid, a->gid, sizeof a->gid);
 	memcpy(c->caps, a->caps, sizeof c->caps);
-	c->bounding = (uint64_t)first[BOUNDING].result;
-	c->ambient = (uint64_t)first[AMBIENT].result;
+	c->bounding = has_caps ? (uint64_t)first[BOUNDING].result : status.caps[STATUS_BOUNDING];
+	c->ambient = has_caps ? (uint64_t)first[AMBIENT].result : status.caps[STATUS_AMBIENT];
 	c->personality = (uint32_t)first[PERSONALITY].result;
 	c->state_permitted = a->state_permitted;
 	c->fsuid = (uint32_t)first[FSUID].result;
@@ -127,6 +144,7 @@ void attributes_answer(const struct inj_syscall *first, const void *out, struct 
 	c->slack_ns = (uint64_t)first[SLACK].result;
 	c->death_signal = a->death_signal;
 	c->subreaper = a->subreaper;
+	return 0;
 }
 
 /* ---- when the app runs again ------------------------------------------------------------ */

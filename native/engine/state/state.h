@@ -114,10 +114,13 @@ void timers_setup(struct process *process, struct setup *setup);
 #define ATTRIBUTES_ASK_BYTES 376
 /* While it is stopped, from outside. */
 void attributes_read_scheduling(pid_t tid, struct scheduling *scheduling);
-/* Calls that query a thread, and its answers; it stores them at `out` (its own address: `remote`).
- * Returns the first of the calls. */
-const struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_remote remote);
-void attributes_answer(const struct inj_syscall *first, const void *out, struct creds *creds);
+/* Calls that query a thread; it stores what they answer at `out`, ATTRIBUTES_ASK_BYTES in its
+ * parasite.  Returns the first of the calls. */
+const struct inj_syscall *attributes_ask(const struct parasite *parasite, struct inj_call *call,
+					 void *out);
+/* While it is still stopped. */
+int attributes_answer(pid_t tid, const struct inj_syscall *first, const void *out,
+		      struct creds *creds, struct avc_error *err) warn_unused;
 /* When the app runs again: each thread, after setup_thread(); the process. */
 int attributes_setup_thread(const struct process *process, const struct thread *main_thread,
 			    const struct thread *thread, struct setup *setup,
