@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 from avckpt.cli.run import settings_of_run
 from avckpt.errors import LabelsWrong
-from avckpt.guard import Files, GuardConfig, Tcp
+from avckpt.guard import Files, GuardConfig, Images, Tcp
 from avckpt.policy import changes, settings_of
 
 
@@ -30,6 +30,7 @@ def test_defaults_are_those_of_the_label_table() -> None:
         restore_window_s=60.0,
         quiesce_s=0.02,
         files=Files.AUTO,
+        images=Images.AUTO,
         remains_s=1.0,
     )
 
@@ -46,6 +47,7 @@ def test_every_label_arrives() -> None:
             "avckpt.quiesce": "0",
             "avckpt.files": "strict",
             "avckpt.tcp": "reset-moved",
+            "avckpt.images": "dirty",
             "avckpt.version": "0.1.0",
             "avckpt.name": "web",
             "io.podman.annotations.foo": "bar",
@@ -63,6 +65,7 @@ def test_every_label_arrives() -> None:
         quiesce_s=0.0,
         files=Files.STRICT,
         tcp=Tcp.RESET_MOVED,
+        images=Images.DIRTY,
         remains_s=1.0,
     )
 

@@ -105,7 +105,7 @@ class Policy:
     """Established TCP connections at a restore: reset-moved, reset, keep or messages."""
     scope: str = "container"
     """What is protected: the container as a whole, or the nodes that its launcher starts by avckpt-init."""
-    images: str = "fork"
+    images: str = "auto"
     """How a checkpoint gets the application's memory: fork, dirty or auto."""
     deadline_s: float = 0.0
     """A recovery that takes longer is reported; 0: none is."""
@@ -479,7 +479,7 @@ LABELS: dict[str, Label] = {
     ),
     "avckpt.files": Label("auto", "auto, rewind, keep or strict", _one_of("files", "auto", "rewind", "keep", "strict")),
     "avckpt.io_uring": Label("on", "on or off", _on_or_off("io_uring")),
-    "avckpt.images": Label("fork", "fork, dirty or auto", _one_of("images", "fork", "dirty", "auto")),
+    "avckpt.images": Label("auto", "auto, fork or dirty", _one_of("images", "fork", "dirty", "auto")),
     "avckpt.shm": Label("4MB", "a size up to 1GB, as 0, 512KB or 4MB", _parse_shm),
     "avckpt.quiesce": Label("20ms", f"0, or {_DURATION}, up to 1s, as 20ms", _parse_quiesce),
     "avckpt.deadline": Label("", f"{_DURATION}, from 1ms to 1h, as 50ms", _parse_deadline),
