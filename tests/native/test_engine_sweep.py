@@ -23,7 +23,7 @@ from avckpt.guard import Images
 
 from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config
 from testkit.harness import ROOT, wait_until
-from testkit.procfs import status_of
+from testkit.procfs import below, state_of, status_of
 
 MOST = 40000
 """System calls or stores of one checkpoint or restore; there are never so many."""
@@ -146,6 +146,8 @@ def test_checkpoint(tmp_path: Path, command: str, way: str, death: Death) -> Non
         else:
             raise AssertionError("it is not done after so many calls")
         protects(guard)
+        # Which only the application could reap, and it does not know of it.
+        assert [pid for pid in below(victim.app) if state_of(pid) == "Z"] == []
     print(f"{runs} runs, up to {nth}")
 
 

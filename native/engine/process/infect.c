@@ -845,6 +845,38 @@ static int clone_holder(struct process *process, pid_t between, pid_t *holder,
 	return 0;
 }
 
+/* A child without exit signal that has ended. */
+static bool is_left_child(const struct process *process, pid_t inside)
+{
+	pid_t children[CHILDREN_MAX];
+	const int count = proc_children(process->pid, children, CHILDREN_MAX);
+	struct proc_stat stat;
+
+	for (int i = 0; i < count; i++)
+		if (proc_inside(children[i]) == inside)
+			return proc_stat(children[i], &stat) == 0 && stat.state == 'Z' &&
+			       !stat.exit_signal;
+	return false;
+}
+
+/* A filter of the thread's own may have refused the wait for a dead guard's intermediate task (see
+ * below), which has been a zombie since. */
+static void reap_left_child(const struct process *process, avc_remote parasite,
+			    struct inj_call *call)
+{
+	struct inj_syscall list[4];
+	const off_t at =
+		(off_t)(parasite + INJ_CODE_BYTES + offsetof(struct inj_control, runner.call));
+
+	if (pread(process->mem_fd, list, sizeof list, at) != sizeof list)
+		return;
+	for (size_t i = 1; i < sizeof list / sizeof *list; i++)
+		if (list[i].nr == INJ_WAIT && list[i].result != list[i - 1].result &&
+		    is_left_child(process, (pid_t)list[i - 1].result))
+			call_add(call, SYS_wait4, (uint64_t)list[i - 1].result, 0,
+				 WNOHANG | __WALL);
+}
+
 /* The holder of a process other than the main one must not be a child of any process of the app:
  * wait(2) would find it.  So an intermediate task clones it, and exits, whereupon it is init's
  * child; the intermediate task is reaped by its parent, which does so in any case before it
@@ -868,6 +900,8 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
 	call_begin(call, INJ_AFTER_HOME);
 	if (thread->creds.subreaper)
 		call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER);
+	for (uint32_t i = 0; i < process->old_parasites && i < INJ_CALLS_MAX / 2; i++)
+		reap_left_child(process, process->old_parasite[i].base, call);
 	call_add(call, SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND);
 	call_add(call, INJ_WAIT);
 	if (thread->creds.subreaper)
