@@ -92,11 +92,42 @@ static int seize_failed(pid_t pid, pid_t tid, struct avc_error *err)
 				    "it is being traced by process %d", status.tracer);
 	}
 	/* Its tracer may have just exited. */
-	if (errnum == EPERM && ptrace(PTRACE_SEIZE, tid, NULL, (long)TRACE_OPTIONS_APP) == 0)
+	if (errnum == EPERM && tracee_seize(tid, (long)TRACE_OPTIONS_APP) == 0)
 		return 0;
+	if (errnum == EAGAIN)
+		return fail(err, AVC_DEADLINE, errnum, tid, "stop", "ptrace(SEIZE)",
+			    "its process is executing another program");
 	errno = errnum;
 	return fail_errno(err, tid, "stop", "ptrace(SEIZE)",
 			  "not allowed to trace it (CAP_SYS_PTRACE and CAP_SYS_ADMIN are needed)");
+}
+
+/* A process or thread created by a traced thread meanwhile. */
+static struct thread *adopt(struct process *process, pid_t tid, struct avc_error *err)
+{
+	struct thread *born = thread_find(process, tid);
+
+	if (!born)
+		born = thread_add(process, tid, err);
+	if (born && !born->attached) {
+		born->attached = true;
+		born->plain = false;
+		born->stopped = false;
+	}
+	return born;
+}
+
+/* There is no tracee of that number any more.  execve(2) gives its caller that of the main thread
+ * (fs/exec.c, de_thread()): it is our tracee still, but none that anybody would release.  True if it
+ * has to be waited for as that. */
+static bool follow_exec(struct process *process, pid_t tid)
+{
+	struct avc_error ignored = { 0 };
+
+	if (!process->leader)
+		tracee_expect_strangers(); /* of a process that is not known any more */
+	return process->leader && tid != process->leader && tracee_is_ours(process->leader) &&
+	       adopt(process, process->leader, &ignored);
 }
 
 int thread_stop(struct process *process, struct thread *thread, struct avc_error *err)
@@ -105,11 +136,13 @@ int thread_stop(struct process *process, struct thread *thread, struct avc_error
 
 	thread->plain = false;
 	process->given = 0;
-	if (ptrace(PTRACE_SEIZE, thread->tid, NULL, (long)TRACE_OPTIONS_APP)) {
-		if (errno == ESRCH)
+	if (tracee_seize(thread->tid, (long)TRACE_OPTIONS_APP)) {
+		errnum = errno;
+		if (errnum == ESRCH) {
+			(void)follow_exec(process, thread->tid);
 			return fail(err, AVC_GONE, ESRCH, thread->tid, "stop", "ptrace(SEIZE)",
 				    "it has ended");
-		errnum = errno;
+		}
 		/* A thread just created by a traced one is our tracee already, though it may not
 		 * have been reported yet. */
 		if (errnum == EPERM && tracee_is_ours(thread->tid)) {
@@ -127,21 +160,6 @@ int thread_stop(struct process *process, struct thread *thread, struct avc_error
 	if (ptrace(PTRACE_INTERRUPT, thread->tid, NULL, NULL))
 		return fail_errno(err, thread->tid, "stop", "ptrace(INTERRUPT)", "it has ended");
 	return 0;
-}
-
-/* A process or thread created by a traced thread meanwhile. */
-static struct thread *adopt(struct process *process, pid_t tid, struct avc_error *err)
-{
-	struct thread *born = thread_find(process, tid);
-
-	if (!born)
-		born = thread_add(process, tid, err);
-	if (born && !born->attached) {
-		born->attached = true;
-		born->plain = false;
-		born->stopped = false;
-	}
-	return born;
 }
 
 /* Whether the call it returns from has created a task that may be our tracee
@@ -176,6 +194,7 @@ int thread_await(struct process *process, struct thread *thread, struct avc_erro
 		break;
 	case STOP_EXIT:
 		thread->attached = false; /* reaped */
+		(void)follow_exec(process, thread->tid);
 		return -1;
 	default:
 		return -1;
@@ -361,7 +380,7 @@ static bool straggle(struct process *process, struct thread *thread)
 		seccomp_end_supervision(tid);
 		thread->attached = false;
 		thread->borrowed = false;
-		return false;
+		return follow_exec(process, tid);
 	case STOP_FORK:
 		take_child(process, thread, stop.message);
 		/* fall through */

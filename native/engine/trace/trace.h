@@ -274,8 +274,8 @@ struct process {
 
 /* ---- tracee.c ---------------------------------------------------------------- */
 
-/* The one signal the library uses, thread-directed, to end a wait(2) in time: it interrupts calls and
- * does nothing else. */
+/* The one signal the library uses, thread-directed, to end a wait(2) or a tracee_seize() in time: it
+ * interrupts calls and does nothing else. */
 int tracee_timer_signal(void);
 int tracee_timer_new(timer_t *timer, struct avc_error *err) warn_unused;
 /* ppoll(2), which ends with EINTR, too, as soon as a tracee has stopped or ended, even before the call. */
@@ -357,6 +357,9 @@ int tracee_ending_pidfd(uint32_t i);
 bool tracee_enters_call(pid_t tid);
 /* Whether it is a tracee of this thread. */
 bool tracee_is_ours(pid_t tid);
+/* PTRACE_SEIZE.  EAGAIN: a thread of its process executes another program, and that may take longer
+ * than there is time, or wait for us. */
+int tracee_seize(pid_t tid, long options) warn_unused;
 /* Whether a tracee has stopped or ended, and tracee_wait() would return at once. */
 bool tracee_has_stopped(pid_t tid);
 /* Holders, and processes that are being created: they must not outlive us. */

@@ -7,6 +7,7 @@
  */
 #include <errno.h>
 #include <sched.h>
+#include <setjmp.h>
 #include <signal.h>
 #include <stdlib.h>
 #include <string.h>
@@ -36,12 +37,28 @@ int tracee_timer_signal(void)
 	return SIGRTMAX - 2;
 }
 
+static __thread struct {
+	volatile sig_atomic_t waits;
+	sigjmp_buf end;
+} seizing;
+
+static void end_seizing(int signal)
+{
+	(void)signal;
+	if (!seizing.waits)
+		return;
+	seizing.waits = 0;
+	siglongjmp(seizing.end, 1);
+}
+
 static void install_handlers(void)
 {
 	struct sigaction action = { .sa_handler = nothing }; /* no SA_RESTART: wait(2) ends */
 
-	sigaction(tracee_timer_signal(), &action, NULL);
 	sigaction(SIGCHLD, &action, NULL);
+	action.sa_handler = end_seizing;
+	action.sa_flags = SA_NODEFER; /* it may be left by a jump */
+	sigaction(tracee_timer_signal(), &action, NULL);
 }
 
 int tracee_poll(struct pollfd *fds, nfds_t n, const struct timespec *timeout)
@@ -285,6 +302,40 @@ bool tracee_has_stopped(pid_t tid)
 	siginfo_t info;
 
 	return !look(tid, &info) || info.si_pid;
+}
+
+/* A tracee that has ended and was not reaped, or there is none that could. */
+static bool any_has_ended(void)
+{
+	siginfo_t info = { 0 };
+
+	return waitid(P_ALL, 0, &info, WEXITED | WNOHANG | WNOWAIT | __WALL | __WNOTHREAD) == 0 &&
+	       info.si_pid;
+}
+
+/* The kernel lets nobody be seized while a thread of its process is in execve(2) (kernel/ptrace.c,
+ * cred_guard_mutex).  And that thread waits until all others of its process are gone, of which we may
+ * trace some: they are gone when we have reaped them (fs/exec.c, de_thread()).  A signal ends
+ * neither wait, as the kernel has ptrace(2) go on after it (ERESTARTNOINTR): its handler has to leave
+ * the call. */
+int tracee_seize(pid_t tid, long options)
+{
+	int result;
+
+	for (;;) {
+		if (sigsetjmp(seizing.end, 0) == 0) {
+			seizing.waits = 1;
+			result = ptrace(PTRACE_SEIZE, tid, NULL, options) == -1 ? -1 : 0;
+			seizing.waits = 0;
+			return result;
+		}
+		if (tracee_is_ours(tid)) /* the tick came right after it */
+			return 0;
+		if (tracee_deadline_passed() || any_has_ended()) {
+			errno = EAGAIN;
+			return -1;
+		}
+	}
 }
 
 #define PC_NS (20 * NS_PER_MS)
