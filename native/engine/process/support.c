@@ -2,7 +2,6 @@
  *
  * Checks for what cannot be protected, while the app runs; and whether this is a quiescent moment.
  */
-#include <dirent.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <stdio.h>
