@@ -3,6 +3,10 @@
 
 from __future__ import annotations
 
+import shutil
+import signal
+import subprocess
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -39,3 +43,37 @@ def test_others_in_their_places(kind: str, tmp_path: Path) -> None:
     """A child replaces a file and the parent puts it back, also between the stages of a checkpoint."""
     with Victim(f"redirect {kind}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 12, (0.01, 0.12))
+
+
+def counted_checkpoint(guard: GuardProcess, summary: Path) -> bool:
+    """Takes one while strace counts; false: it was missed."""
+    status = Path(f"/proc/{guard.pid}/status")
+    command = ["strace", "-f", "-c", "-qq", "-o", str(summary), "-p", str(guard.pid)]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as strace:
+        traced = f"TracerPid:\t{strace.pid}\n"
+        wait_until(lambda: traced in status.read_text(), 10 * SLOWNESS, "strace traces it", 0.001)
+        answer = guard.command("checkpoint")
+        strace.send_signal(signal.SIGINT)
+    return bool(answer["kind"] == "checkpoint")
+
+
+def calls_of_a_checkpoint(victim: Victim, folder: Path) -> Counter[str]:
+    """How often a guard makes each system call for one that is not its first."""
+    summary = folder / f"{victim.board.path.name}.calls"
+    with GuardProcess(config(freeze_deadline_s=5.0 * SLOWNESS), [victim.pid]) as guard:
+        for _ in range(2):
+            wait_until(lambda: guard.command("checkpoint")["kind"] == "checkpoint", 60 * SLOWNESS, "a checkpoint")
+        wait_until(lambda: counted_checkpoint(guard, summary), 60 * SLOWNESS, "one that is counted")
+    lines = [line.split() for line in summary.read_text().splitlines()[2:-2]]
+    return Counter({line[-1]: int(line[3]) for line in lines})
+
+
+@pytest.mark.skipif(not shutil.which("strace"), reason="strace is what counts; it is not installed")
+def test_what_children_share_is_compared_once(tmp_path: Path) -> None:
+    """By kcmp(2), after the freeze, and not also in the look before it."""
+    children, pairs = 8, 100
+    with Victim(f"heirs {children}/{pairs} {tmp_path}", tmp_path) as victim:
+        calls = calls_of_a_checkpoint(victim, tmp_path)
+    shared = (children + 1) * 2 * pairs  # one of them has a child, too
+    # strace makes everything slow, so that it may take four tries, of which three do not get that far.
+    assert shared / 2 < calls["kcmp"] < 1.8 * shared

@@ -70,8 +70,11 @@ struct look {
 	pid_t pid, init;
 	int pidfd, fd_dir;
 	enum files_depth depth;
-	bool trusts;    /* heirs are assumed unchanged: files_check_heirs() */
-	uint32_t later; /* how many new sockets may still be left to the freeze */
+	bool trusts; /* heirs are assumed unchanged: files_check_heirs() */
+	bool reuses; /* the same before a freeze */
+	const uint8_t *likely;
+	int likely_count; /* of files_survey(): by number, which are the parent's */
+	uint32_t later;   /* how many new sockets may still be left to the freeze */
 	const char *refuses;
 	struct {
 		uint64_t dev, ino; /* 0: unknown */
@@ -116,6 +119,9 @@ void files_free(struct files *files)
 		file_socket_free(f->socket);
 		free(f->content);
 	}
+	files_free(files->heirs);
+	free(files->varied);
+	free(files->own);
 	free(files->ends);
 	free(files->file);
 	free(files->area);
@@ -352,13 +358,32 @@ static bool has_no_lock(const struct look *look, const struct file *is)
 	return own.told_flags >= 0 && !own.lock_count;
 }
 
+static bool is_unchanged(const struct file *k, const struct file *is)
+{
+	return files_same_object(k, is) && k->mode == is->mode;
+}
+
+/* It was its parent's before, which still has such a file there.  The checkpoint finds out whether it
+ * is the same one, in any case.  But locks are asked for again. */
+static bool was_parents(const struct look *look, const struct file *is)
+{
+	const struct file *k = look->reuses ? files_find(look->known, is->fd) : NULL;
+
+	if (!look->known && is->fd < look->likely_count)
+		return look->likely[is->fd] && is->kind != FILE_REGULAR;
+	return k && k->heir && is->kind != FILE_REGULAR && is_unchanged(k, is);
+}
+
 static bool copy_before(const struct look *look, const struct file *is, struct file *f)
 {
 	size_t bytes;
 	char *name;
 
-	if (is_anonymous(is) || is->lock_count || !is->name || !is_parents(look, is) ||
-	    !has_no_lock(look, is))
+	if (is_anonymous(is) || is->lock_count || !is->name)
+		return false;
+	if (was_parents(look, is))
+		look->files->reused = true;
+	else if (!is_parents(look, is) || !has_no_lock(look, is))
 		return false;
 	bytes = strlen(is->name) + 1;
 	name = budget_take(bytes) ? malloc(bytes) : NULL;
@@ -372,22 +397,30 @@ static bool copy_before(const struct look *look, const struct file *is, struct f
 	return true;
 }
 
-static bool copy_frozen(const struct look *look, const struct file *is, struct file *f)
+/* For locks and watches there is more to read. */
+static bool may_copy(const struct file *k, const struct file *is)
 {
-	const struct file *k = files_find(look->known, is->fd);
+	return k && is && is->known && !k->remote && !k->lock_count && !is->lock_count &&
+	       !is->watch_count && !is->mark_count && files_same_object(k, is) &&
+	       !(is->kind == FILE_REGULAR && is->told_ino);
+}
 
-	/* For locks and watches there is more to read. */
-	if (!k || !is->known || k->remote || k->lock_count || is->lock_count || is->watch_count ||
-	    is->mark_count || !files_same_object(k, is) ||
-	    (is->kind == FILE_REGULAR && is->told_ino) ||
-	    !((look->trusts && k->heir) || is_parents(look, is)))
-		return false;
+static bool take_over(const struct look *look, const struct file *is, struct file *f)
+{
 	copy_of(f, is);
 	if (!take_known(look, f))
 		return false;
 	if (!f->socket) /* it was left to its parent's look */
 		f->socket = file_socket_share(is->socket);
 	return true;
+}
+
+static bool copy_frozen(const struct look *look, const struct file *is, struct file *f)
+{
+	const struct file *k = files_find(look->known, is->fd);
+
+	return may_copy(k, is) && ((look->trusts && k->heir) || is_parents(look, is)) &&
+	       take_over(look, is, f);
 }
 
 /* What belongs to the table matters as little as in a freeze; and a table of its own is rebuilt. */
@@ -399,10 +432,23 @@ static bool copy_now(const struct look *look, const struct file *is, struct file
 	return true;
 }
 
+/* In a freeze an ancestor may have it, from whom the parent has it. */
+static const struct file *find_parents(const struct files *files, int number)
+{
+	const struct file *is, *k;
+
+	for (files = files->parent; files; files = files->parent) {
+		is = files_find(files, number);
+		k = is ? NULL : files_find(files->heirs, number);
+		if (is || !k || !k->heir)
+			return is;
+	}
+	return NULL;
+}
+
 static bool look_at_inherited(const struct look *look, int number, struct file *f)
 {
-	const struct file *is = look->files->parent ? files_find(look->files->parent, number)
-						    : NULL;
+	const struct file *is = find_parents(look->files, number);
 
 	if (!is || is->remote)
 		return false;
@@ -860,6 +906,19 @@ static bool may_be_ours(struct files *files, const struct file *f)
 	return !f->outside && (f->kind == FILE_PIPE || (f->socket && f->socket->peer));
 }
 
+/* Heirs are what they were before the freeze. */
+static bool has_other_end(struct files *files, const struct file *f)
+{
+	return files_other_end(files, f) || (files->heirs && files_other_end(files->heirs, f));
+}
+
+/* Once for each object, from an end that can be read. */
+static bool may_have_content(const struct file *f)
+{
+	return !(f->kind == FILE_PIPE && (f->flags & O_ACCMODE) == O_WRONLY) &&
+	       f->shared == f->fd && !f->outside && is_channel(f);
+}
+
 /* What its parent's look has found in it. */
 static void copy_content(const struct files *parent, struct file *f)
 {
@@ -924,7 +983,7 @@ static void keep_end(struct reading *reading, struct file *f, short revents)
 		return;
 	if (revents & POLLRDHUP && f->socket)
 		f->socket->shut |= SHUT_IN;
-	f->ended = revents & POLLHUP && !files_other_end(files, f);
+	f->ended = revents & POLLHUP && !has_other_end(files, f);
 	if (revents & POLLIN && (f->ended || may_be_ours(files, f)))
 		file_keep_content(reading->image->process, f->ours, f, reading->scratch);
 }
@@ -942,14 +1001,9 @@ static void keep_content(struct reading *reading, struct file *f)
 {
 	const struct image *image = reading->image;
 
-	/* Once for each object, from an end that can be read. */
-	if ((f->kind == FILE_PIPE && (f->flags & O_ACCMODE) == O_WRONLY) || f->shared != f->fd ||
-	    f->outside || !is_channel(f))
+	/* What is inherited: files_fill_heirs(). */
+	if (f->inherited || !may_have_content(f))
 		return;
-	if (f->inherited) {
-		copy_content(image->files->parent, f);
-		return;
-	}
 	if (f->pipe_bytes < 0) {
 		f->content_lost = true;
 		return;
@@ -1059,24 +1113,158 @@ static int walk(struct look *look, uint32_t seen, struct avc_error *err)
 	}
 }
 
-/* Duplicates those that existed before: the heirs, or all others.  Whether all still exist. */
-static int look_at_known(struct look *look, bool heirs, bool *same, struct avc_error *err)
+/* How many it has, since Linux 6.2. */
+static int64_t size_of_table(const struct look *look)
+{
+	struct stat st;
+
+	return fstat(look->fd_dir, &st) ? -1 : st.st_size;
+}
+
+/* Most have what they had before, or what their parent has; and to list a table takes longer than to
+ * look for those. */
+static int walk_before(struct look *look, struct avc_error *err)
+{
+	const struct files *likely = look->known ? look->known : look->files->parent;
+
+	for (uint32_t i = 0; likely && i < likely->count; i++)
+		if (look_at(look, likely->file[i].fd, err))
+			return -1;
+	return size_of_table(look) == look->files->count ? 0 : walk(look, look->files->count, err);
+}
+
+/* One that existed before, in its place. */
+static int look_at_place(struct look *look, uint32_t i, bool *same, struct avc_error *err)
 {
 	struct files *files = look->files;
 
-	*same = true;
-	for (uint32_t i = 0; i < look->known->count; i++) {
-		const struct file *k = &look->known->file[i];
+	files->count = i;
+	if (look_at(look, look->known->file[i].fd, err))
+		return -1;
+	if (files->count == i)
+		files->file[i].fd = -1; /* it has been closed             */
+	*same &= files->count > i && files->file[i].known;
+	return 0;
+}
 
-		if (k->heir != heirs)
-			continue;
-		files->count = i;
-		if (look_at(look, k->fd, err))
+static int look_at_heirs(struct look *look, bool *same, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < look->known->count; i++)
+		if (look->known->file[i].heir && look_at_place(look, i, same, err))
 			return -1;
-		if (files->count == i)
-			files->file[i].fd = -1; /* it has been closed             */
-		*same &= files->count > i && files->file[i].known;
+	return 0;
+}
+
+/* Whether all others still exist. */
+static int look_at_own(struct look *look, bool *same, struct avc_error *err)
+{
+	*same = true;
+	for (uint32_t i = 0; i < look->known->own_count; i++)
+		if (look_at_place(look, look->known->own[i], same, err))
+			return -1;
+	return 0;
+}
+
+static int by_value(const void *a, const void *b)
+{
+	const int x = *(const int *)a, y = *(const int *)b;
+
+	return (x > y) - (x < y);
+}
+
+static void add_varied(struct files *files, const struct file *k)
+{
+	if (!may_copy(k, files_find(files, k->fd)) || !is_unchanged(k, files_find(files, k->fd)))
+		files->varied[files->varied_count++] = k->fd;
+}
+
+/* Its children's heirs are like `known`, for each of which this is done once, and not once for each
+ * child. */
+static void note_varied(struct files *files, const struct files *known)
+{
+	const struct files *parent = files->heirs ? files->parent : NULL;
+	uint32_t room = 1 + known->count + (parent ? parent->varied_count : 0);
+
+	files->varied = budget_take(room * sizeof(int)) ? malloc(room * sizeof(int)) : NULL;
+	if (!files->varied)
+		return;
+	if (!parent)
+		for (uint32_t i = 0; i < known->count; i++)
+			add_varied(files, &known->file[i]);
+	for (uint32_t i = 0; parent && i < known->own_count; i++)
+		add_varied(files, &known->file[known->own[i]]);
+	for (uint32_t i = 0; parent && i < parent->varied_count; i++) {
+		const struct file *k = files_find(known, parent->varied[i]);
+
+		if (k && k->heir)
+			files->varied[files->varied_count++] = k->fd;
 	}
+	qsort(files->varied, files->varied_count, sizeof *files->varied, by_value);
+	files->varied_known = true;
+}
+
+/* Whether what it shares with its parent can be written down after the freeze. */
+static bool may_leave_heirs(const struct look *look)
+{
+	const struct files *files = look->files, *parent = files->parent, *known = look->known;
+
+	if (!look->trusts || !parent || !parent->varied_known ||
+	    known->parent_number != parent->process->files_before->number)
+		return false;
+	for (uint32_t i = 0; i < known->own_count; i++) {
+		const struct file *f = &files->file[known->own[i]];
+
+		if (f->shared != f->fd &&
+		    syscall(SYS_kcmp, look->pid, look->pid, KCMP_FILE, f->fd, f->shared))
+			return false;
+	}
+	return true;
+}
+
+/* Closes the gaps between its own and `at`, both by index and ascending. */
+static void keep_looked_at(struct look *look, const uint32_t *at, uint32_t count)
+{
+	const struct files *known = look->known;
+	struct files *files = look->files;
+
+	files->count = 0;
+	for (uint32_t own = 0, other = 0; own < known->own_count || other < count;) {
+		const bool is_own = other == count ||
+				    (own < known->own_count && known->own[own] < at[other]);
+		const uint32_t i = is_own ? known->own[own++] : at[other++];
+
+		if (files->file[i].fd >= 0)
+			files->file[files->count++] = files->file[i];
+	}
+}
+
+/* There may be as many as processes times the descriptors of the first: so they are written down when
+ * the app runs again (files_fill_heirs()), except for what has to be read. */
+static int leave_heirs(struct look *look, struct avc_error *err)
+{
+	struct files *files = look->files, *known = look->known;
+	const struct files *parent = files->parent;
+	uint32_t *at = calloc(parent->varied_count + 1, sizeof *at), count = 0;
+	bool ignored;
+	int result = 0;
+
+	if (!at)
+		return fail_errno(err, look->pid, "freeze", "calloc", "out of memory");
+	for (uint32_t i = 0; !result && i < parent->varied_count; i++) {
+		const struct file *k = files_find(known, parent->varied[i]);
+
+		if (!k || !k->heir)
+			continue;
+		at[count++] = (uint32_t)(k - known->file);
+		result = look_at_place(look, at[count - 1], &ignored, err);
+	}
+	keep_looked_at(look, at, result ? 0 : count);
+	free(at);
+	if (result)
+		return -1;
+	if (!budget_take((uint64_t)(known->count - files->count) * sizeof *files->file))
+		return budget_check(look->pid, err);
+	files->heirs = files_share(known);
 	return 0;
 }
 
@@ -1088,14 +1276,6 @@ static void close_gaps(struct files *files, uint32_t count)
 			files->file[files->count++] = files->file[i];
 }
 
-/* How many it has, since Linux 6.2. */
-static int64_t size_of_table(const struct look *look)
-{
-	struct stat st;
-
-	return fstat(look->fd_dir, &st) ? -1 : st.st_size;
-}
-
 /* Heirs are by far the most numerous, and take time.  A process with the same number of
  * descriptors, and with its own unchanged, most likely still has them, which is checked when it
  * runs again.  With the same number, there is no new one. */
@@ -1105,11 +1285,13 @@ static int walk_frozen(struct look *look, struct avc_error *err)
 	const int64_t size = size_of_table(look);
 	bool same;
 
-	if (look_at_known(look, false, &same, err))
+	if (look_at_own(look, &same, err))
 		return -1;
 	look->trusts = same && size == count && !look->files->process->heirs_vary;
 	look->files->trusted = look->trusts;
-	if (look_at_known(look, true, &same, err))
+	if (may_leave_heirs(look))
+		return leave_heirs(look, err);
+	if (look_at_heirs(look, &same, err))
 		return -1;
 	close_gaps(look->files, count);
 	return size == look->files->count ? 0 : walk(look, look->files->count, err);
@@ -1133,6 +1315,9 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 			     .init = init,
 			     .pidfd = owner->pidfd,
 			     .later = SOCKETS_LATER,
+			     .reuses = owner->reuses,
+			     .likely = owner->likely,
+			     .likely_count = owner->reuses ? owner->likely_count : 0,
 			     .depth = depth };
 	struct timespec now;
 	int result;
@@ -1157,6 +1342,8 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 		result = walk_known(&look, err);
 	else if (depth == FILES_FROZEN && known && known->count <= files->room)
 		result = walk_frozen(&look, err);
+	else if (depth == FILES_BEFORE)
+		result = walk_before(&look, err);
 	else
 		result = walk(&look, 0, err);
 	close(look.fd_dir);
@@ -1243,14 +1430,25 @@ static void survey(struct aside *aside)
 }
 
 /* Only heirs that occur once: one that occurs twice could be moved and moved back unnoticed. */
-static void note_heirs(struct files *files)
+static bool note_heirs(struct files *files)
 {
+	static uint64_t number;
+
+	files->number = ++number;
+	files->parent_number = files->parent ? files->parent->number : 0;
+	files->own = malloc((files->count + 1) * sizeof *files->own);
+	if (!files->own)
+		return false;
 	for (uint32_t i = 0; i < files->count; i++)
 		files->file[i].heir = files->file[i].inherited;
 	for (uint32_t i = 0; i < files->count; i++)
 		if (files->file[i].shared != files->file[i].fd)
 			files->file[i].heir = files_find(files, files->file[i].shared)->heir =
 				false;
+	for (uint32_t i = 0; i < files->count; i++)
+		if (!files->file[i].heir)
+			files->own[files->own_count++] = i;
+	return true;
 }
 
 /* Not needed afterwards. */
@@ -1270,11 +1468,12 @@ static void drop_survey(struct aside *aside)
 		forget_parent(job->files);
 	files_free(job->files);
 	files_free(job->last);
+	free(job->owner.likely);
 	close_fd(&job->owner.pidfd);
 	free(job);
 }
 
-static struct files *look_before(const struct process *process, const struct process *parent,
+static struct files *look_before(struct process *process, const struct process *parent,
 				 struct avc_error *err)
 {
 	static int left_behind;
@@ -1282,18 +1481,24 @@ static struct files *look_before(const struct process *process, const struct pro
 	struct files *files = NULL;
 
 	if (job)
-		*job = (struct survey){ .aside = { survey, drop_survey, &left_behind },
-					.files = files_new(process->files_seen + ROOM_SPARE),
-					.owner = {
-						.pid = process->pid,
-						.pidfd = fcntl(process->pidfd, F_DUPFD_CLOEXEC, 3),
-						.init = process->init } };
+		*job = (struct survey){
+			.aside = { survey, drop_survey, &left_behind },
+			.files = files_new(process->files_seen + ROOM_SPARE),
+			.owner = { .pid = process->pid,
+				   .pidfd = fcntl(process->pidfd, F_DUPFD_CLOEXEC, 3),
+				   .init = process->init,
+				   .reuses = !process->heirs_change && !process->heirs_vary }
+		};
 	if (!job || !job->files || job->owner.pidfd < 0) {
 		fail_errno(err, process->pid, "look at descriptors", "calloc", "out of memory");
 		if (job)
 			drop_survey(&job->aside);
 		return NULL;
 	}
+	job->owner.likely = process->heirs_likely;
+	job->owner.likely_count = process->heirs_count;
+	process->heirs_likely = NULL;
+	process->heirs_count = 0;
 	if (process->files_before)
 		job->last = files_share(process->files_before);
 	if (parent && parent->files_before) {
@@ -1307,10 +1512,11 @@ static struct files *look_before(const struct process *process, const struct pro
 	}
 	if (job->result) {
 		*err = err->code ? *err : job->error;
+	} else if (!note_heirs(job->files)) {
+		fail_errno(err, process->pid, "look at descriptors", "malloc", "out of memory");
 	} else {
 		files = job->files;
 		job->files = NULL;
-		note_heirs(files);
 		forget_parent(files);
 	}
 	drop_survey(&job->aside);
@@ -1363,7 +1569,9 @@ static void look_frozen(struct image *image, const struct image *parent, bool se
 			uint32_t *ours)
 {
 	struct process *process = image->process;
-	const struct files_owner owner = { process->pid, process->pidfd, process->init };
+	const struct files_owner owner = { .pid = process->pid,
+					   .pidfd = process->pidfd,
+					   .init = process->init };
 	struct files *files = process->files_image;
 
 	process->files_image = NULL;
@@ -1375,6 +1583,9 @@ static void look_frozen(struct image *image, const struct image *parent, bool se
 	files->process = process;
 	if (image->shared & CLONE_FILES)
 		return;
+	if (parent && files_are_read(parent) && parent->process->files_before &&
+	    !parent->files->varied)
+		note_varied(parent->files, parent->process->files_before);
 	if (files_look(files, &owner, FILES_FROZEN, process->files_before, &image->files_error))
 		return;
 	find_owners(process, files);
@@ -1407,6 +1618,70 @@ void files_capture(struct image *image, uint32_t images)
 	scratch_close(&scratch);
 }
 
+/* The parent's are complete.  In place, from the last one: all others move up. */
+static int fill_in(struct image *image, const struct files *parent, struct avc_error *err)
+{
+	struct files *files = image->files, *known = files->heirs;
+	const struct look look = {
+		.files = files, .known = known, .pid = image->process->pid, .depth = FILES_FROZEN
+	};
+	uint32_t left = files->count, at = left;
+	int result = 0;
+
+	for (uint32_t i = 0; i < known->count; i++)
+		at += known->file[i].heir && !files_find(files, known->file[i].fd);
+	files->count = at;
+	for (uint32_t i = known->count; i > 0 && at > left; i--) {
+		const struct file *k = &known->file[i - 1], *is = files_find(parent, k->fd);
+		struct file *f;
+
+		while (left && files->file[left - 1].fd > k->fd)
+			files->file[--at] = files->file[--left];
+		if (!k->heir || (left && files->file[left - 1].fd == k->fd))
+			continue;
+		f = &files->file[--at];
+		if (is && take_over(&look, is, f))
+			continue;
+		*f = (struct file){ .fd = k->fd, .shared = k->fd, .offset = -1 };
+		image->process->heirs_vary = true;
+		result = fail(err, AVC_RETRY, 0, image->pid, "freeze", "",
+			      "descriptor %d was changed meanwhile", k->fd);
+	}
+	files->heirs = NULL;
+	files_free(known);
+	free(files->ends);
+	files->ends = NULL;
+	files->end_count = 0;
+	return result;
+}
+
+int files_fill_heirs(struct image *image, uint32_t images, struct avc_error *err)
+{
+	for (uint32_t i = 1; i < images; i++) {
+		const struct files *parent = image[image[i].parent < 0 ? 0 : image[i].parent].files;
+		struct files *files = image[i].files;
+
+		if (!files_are_read(&image[i]))
+			continue;
+		if (files->heirs) {
+			if (fill_in(&image[i], parent, err))
+				return -1;
+			find_owners(image[i].process, files);
+			find_own_pidfds(image[i].process, files);
+		}
+		for (uint32_t k = 0; k < files->count; k++) {
+			struct file *f = &files->file[k];
+
+			if (!f->inherited)
+				continue;
+			f->inherited = files_find(parent, f->fd); /* that was moved */
+			if (may_have_content(f))
+				copy_content(parent, f);
+		}
+	}
+	return 0;
+}
+
 /* flock(2) cannot be observed cheaply: a lock that exists after the freeze, but not before, may be
  * from either side of it, and is left alone at a restore. */
 void files_settle(struct image *image)
@@ -1436,4 +1711,7 @@ void files_forget(struct process *process)
 	files_free(process->files_image);
 	process->files_before = NULL;
 	process->files_image = NULL;
+	free(process->heirs_likely);
+	process->heirs_likely = NULL;
+	process->heirs_count = 0;
 }

@@ -45,6 +45,9 @@ int files_prepare(struct process *process, const struct process *parent,
 /* During it: reads the state of this instant of all processes, or records why that of one could not
  * be read. */
 void files_capture(struct image *image, uint32_t images);
+/* Right after it, with the app running again: what children share with their parents, which the freeze
+ * has not written down for each of them. */
+int files_fill_heirs(struct image *image, uint32_t images, struct avc_error *err) warn_unused;
 /* Checks what the freeze left out, in the templates (files_heirs.c).  AVC_RETRY: what a process
  * shares with its parent has changed meanwhile. */
 int files_check_heirs(struct image *image, uint32_t images, struct avc_error *err) warn_unused;
@@ -62,6 +65,10 @@ void files_forget(struct process *process);
 /* Why one that has /dev/fuse open cannot be protected: and whoever exits with a file of its server's
  * open waits for that. */
 extern const char files_serves[];
+/* Before a process is looked at for the first time: whether it has what cannot be protected.  The
+ * descriptors of `parent` (may be NULL) have been looked at already.  -1 with errno: it has ended. */
+int files_survey(struct process *process, const struct process *parent,
+		 const char **refused) warn_unused;
 /* Why a process that has a descriptor of that name cannot be protected, or NULL. */
 const char *files_refuses(const char *name);
 void files_free(struct files *files);
@@ -306,7 +313,18 @@ struct files {
 	uint32_t count, room;
 	const struct file **ends; /* pipes and sockets by inode, built on demand: allocated */
 	uint32_t end_count;
-	bool trusted;           /* its heirs were not read in the freeze */
+	/* Of a read before a freeze: its number and that of the parent's, from which the heirs are;
+	 * which are no heirs, by index (allocated); and whether some were not compared again. */
+	uint64_t number, parent_number;
+	uint32_t *own, own_count;
+	bool reused;
+	bool trusted; /* its heirs were not read in the freeze */
+	/* In a freeze: heirs of this one are not in here yet (files_fill_heirs()); NULL: all are. */
+	struct files *heirs;
+	/* What children cannot have from here unseen, ascending (allocated), and whether it is known. */
+	int *varied;
+	uint32_t varied_count;
+	bool varied_known;
 	bool served;            /* some file system may be a file server's                 */
 	bool several;           /* other processes may have the other ends of pipes        */
 	bool with_tcp;          /* count the bytes of connections, during a freeze, too      */
@@ -341,6 +359,9 @@ struct files_owner {
 	pid_t pid;
 	int pidfd;
 	pid_t init;
+	bool reuses;     /* what was found before need not be compared again */
+	uint8_t *likely; /* process->heirs_likely                          */
+	int likely_count;
 };
 /* `files->parent` may be set. */
 int files_look(struct files *files, const struct files_owner *owner, enum files_depth depth,

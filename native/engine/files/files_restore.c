@@ -744,7 +744,9 @@ static int find_missing(const struct files_work *work, struct files_missing *mis
 static int look_once(struct files_work *work, const struct files_missing *missing,
 		     struct avc_error *err)
 {
-	const struct files_owner owner = { work->table, work->table_pidfd, work->init };
+	const struct files_owner owner = { .pid = work->table,
+					   .pidfd = work->table_pidfd,
+					   .init = work->init };
 	int result = 0;
 
 	work->now->missing = missing;

@@ -33,7 +33,7 @@ static bool was_written(const struct files *want, const struct file *w, const st
 int files_check_strict(const struct image *image, pid_t pid, int pidfd, pid_t init, pid_t holder,
 		       struct avc_error *err)
 {
-	const struct files_owner owner = { pid, pidfd, init };
+	const struct files_owner owner = { .pid = pid, .pidfd = pidfd, .init = init };
 	const struct files *want = image->files;
 	struct files *now = files_new(want->count + 64);
 	int result = -1;

@@ -150,9 +150,12 @@ static int prepare_process(struct avc_guard *guard, uint32_t entry, uint32_t *la
 			   struct avc_error *err)
 {
 	struct process *process = guard->tree.entry[entry].process;
+	const int above = guard->tree.entry[entry].parent;
+	const struct process *parent = entry ? guard->tree.entry[above < 0 ? 0 : above].process
+					     : NULL;
 	const uint64_t deadline = guard->config.freeze_deadline_ns;
 
-	if (process_follow(process, err) || support_check(process, err) ||
+	if (process_follow(process, err) || support_check(process, parent, err) ||
 	    process_list_threads(process, err))
 		return -1;
 	if (process->infected && (process->thread_count > process->parasite.threads_max ||
@@ -476,7 +479,8 @@ static int finish(struct avc_guard *guard, struct generation *fresh, struct avc_
 {
 	int result;
 
-	if (generation_files_error(fresh, err))
+	if (generation_files_error(fresh, err) ||
+	    files_fill_heirs(fresh->image, fresh->images, err))
 		return -1;
 	if (faults_heard(&guard->faults))
 		return fail(err, AVC_DEADLINE, 0, guard->main.pid, "freeze", "",

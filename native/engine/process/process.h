@@ -233,7 +233,8 @@ void tracker_remove(struct tracker *tracker, const struct pageset *set);
 
 /* Looks at a running app for what cannot be protected.  0, or -1 with
  * AVC_UNSUPPORTED and the reason in words. */
-int support_check(struct process *process, struct avc_error *err) warn_unused;
+int support_check(struct process *process, const struct process *parent,
+		  struct avc_error *err) warn_unused;
 /* True if no thread seems to be in the middle of work. */
 bool process_is_quiescent(const struct process *process);
 

@@ -2,7 +2,6 @@
  *
  * Checks for what cannot be protected, while the app runs; and whether this is a quiescent moment.
  */
-#include <dirent.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <stdio.h>
@@ -17,28 +16,15 @@
 #include "process.h"
 
 /* Before injection; from then on the look before each freeze (files_prepare()) does the same. */
-static int check_descriptors(const struct process *process, struct avc_error *err)
+static int check_descriptors(struct process *process, const struct process *parent,
+			     struct avc_error *err)
 {
-	char path[64], link[128];
-	struct dirent *entry;
 	const char *refused = NULL;
-	DIR *dir;
 
 	if (process->infected)
 		return 0;
-	snprintf(path, sizeof path, "/proc/%d/fd", process->pid);
-	dir = opendir(path);
-	if (!dir)
+	if (files_survey(process, parent && parent->infected ? parent : NULL, &refused))
 		return fail_errno(err, process->pid, "check", "open(fd)", "it has ended");
-	while (!refused && (entry = readdir(dir))) {
-		ssize_t n = readlinkat(dirfd(dir), entry->d_name, link, sizeof link - 1);
-
-		if (n <= 0)
-			continue;
-		link[n] = 0;
-		refused = files_refuses(link);
-	}
-	closedir(dir);
 	return refused ? fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "", "%s", refused)
 		       : 0;
 }
@@ -191,14 +177,14 @@ static void note_filters(struct process *process, uint32_t count)
 	process->filters = count;
 }
 
-int support_check(struct process *process, struct avc_error *err)
+int support_check(struct process *process, const struct process *parent, struct avc_error *err)
 {
 	struct proc_status status;
 
 	if (proc_status_of(process->status_fd, process->pid, &status))
 		return fail_errno(err, process->pid, "check", "open(status)", "it has ended");
 	if (check_word_size(process, err) || check_shadow_stack(process, &status, err) ||
-	    check_namespaces(process, err) || check_descriptors(process, err) ||
+	    check_namespaces(process, err) || check_descriptors(process, parent, err) ||
 	    check_mappings(process, err))
 		return -1;
 	dying_note_caught(process, &status);

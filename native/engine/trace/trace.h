@@ -237,7 +237,11 @@ struct process {
 	pid_t init;            /* avckpt-init                                      */
 	struct files *files_before, *files_image; /* files.c                   */
 	uint32_t files_seen;
-	bool heirs_vary;   /* inherited files changed in a freeze                    */
+	/* By number: found to be the parent's before the first look; allocated, NULL: not known. */
+	uint8_t *heirs_likely;
+	int heirs_count;
+	bool heirs_change; /* inherited files have changed between two checkpoints    */
+	bool heirs_vary;   /* ... in a freeze                                        */
 	bool tcp_moved;    /* bytes of connections are counted                 */
 	bool tcp_messages; /* quiescent only between two messages              */
 	/* Of a process that is not the main one (tree.c). */
