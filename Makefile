@@ -76,7 +76,7 @@ wheel: setup-build ## a wheel for pipx or pip, with everything `avckpt install -
 test-packages: setup ## install the wheel and the .deb, build the sidecar's image from the wheel
 	@AVCKPT_LONG=1 $(VENV)/python -m pytest tests/integration/test_packages.py --timeout 900 $(PYTEST_ARGS)
 
-sweep: setup-build ## kill the guard before each of its system calls and stores, one run each: nobody notices (an hour)
+sweep: setup-build ## kill the guard before each of its system calls and stores, one run each: nobody notices (three hours)
 	@AVCKPT_SWEEP=all $(VENV)/python -m pytest tests/native/test_engine_sweep.py $(PYTEST_ARGS) $(if $(T),-k "$(T)")
 
 test-programs: setup ## checkpoint, kill and restore real programs, ROUNDS times each, in both modes of avckpt.tcp
