@@ -35,6 +35,7 @@ from testkit.harness import (
 )
 
 SHARED = pytest.mark.shared_machine("hooks give up after seconds, and come later than that where they get no CPU")
+CRUN_DIES = "crun dies of SIGPIPE, if a hook that is not there fails before it is written to"
 
 INIT = "/run/avckpt-init --wait-ms 2000 --stop-signal"
 # With the newline that journald waits for.
@@ -474,9 +475,8 @@ def test_uninstalled_while_a_container_runs(machine: None, podman: Podman, name:
         assert not os.path.exists("/usr/local/libexec/avckpt")
 
 
-@pytest.mark.skipif(
-    SLOWNESS > 1, reason="crun dies of SIGPIPE, if a hook that is not there fails before it is written to"
-)
+@pytest.mark.skipif(SLOWNESS > 1, reason=CRUN_DIES)
+@pytest.mark.shared_machine(CRUN_DIES)
 def test_hooks_that_go_away_do_not_keep_a_container_from_ending(
     podman: Podman, hooks_dir: Path, tmp_path: Path, base_image: str, run_dir: Path
 ) -> None:
