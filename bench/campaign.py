@@ -3,6 +3,8 @@
 
     python -m bench.campaign --runs 50 --seconds 60        into bench/results/campaign.json
 
+Hours: with `--go-on`, what --output has of the same seconds and labels counts, so that it can be made in parts.
+
 Each run is a program of bench/faults in a container of Podman's, with hooks and sidecar of this
 checkout: its own, so that the machine's are left alone.  It computes a known series and sends each
 term; an oracle compares.  A node of ROS publishes the terms instead, and another node, which is not
@@ -24,8 +26,10 @@ from __future__ import annotations
 import argparse
 import concurrent.futures
 import contextlib
+import itertools
 import json
 import os
+import random
 import shutil
 import signal
 import socket
@@ -51,6 +55,8 @@ ROS_IMAGE = "localhost/avckpt-ros:latest"
 ROS_BUILD_IMAGE = "localhost/avckpt-ros-build"
 OUTCOMES = ("recovered", "recrashed", "wrong", "cold", "stuck", "unharmed")
 LABELS = {"avckpt.enable": "true", "avckpt.interval": "200ms"}
+MOMENT_S = 1.0
+"""So long after the program is protected, at most, comes the signal: at no particular time since a checkpoint."""
 POISON_EVERY_S = 1.0
 """Poison comes back: whoever sent it has had no answer."""
 SILENT_S = 2.0
@@ -160,12 +166,21 @@ class Cell:
     failed: int = 0
     """Runs that could not be made: the program was not protected in time."""
 
+    @property
+    def runs(self) -> int:
+        """That were counted."""
+        return sum(self.counted.values())
+
+    def missing(self, wanted: int) -> int:
+        """Runs; one that could not be made is tried again, but not for ever."""
+        return wanted - self.runs if self.failed < wanted else 0
+
     def to_json(self) -> dict[str, object]:
         """As in the results."""
         return {
             "fault": self.fault,
             "language": self.language,
-            "runs": sum(self.counted.values()),
+            "runs": self.runs,
             **self.counted,
             "not_made": self.failed,
             "detected_max_s": max(self.detected_s, default=None),
@@ -238,6 +253,7 @@ class Run:
     def outcome(self) -> str:
         """Makes it.  Raises TimeoutError, OSError or CommandFailed when the program could not be protected."""
         cell, port = self._cell, str(self._oracle.port)
+        moment_s = random.uniform(0, MOMENT_S)
         try:
             if cell.language == "ROS":
                 self._world.podman.run("exec", "--detach", self._world.core, cell.command[0], "relay", port)
@@ -245,6 +261,7 @@ class Run:
             self._world.start(self.name, cell.image, [*cell.command, cell.fault, port], options, protect=True)
             wait_until(lambda: self._row().get("generations", 0) >= 2, 30, "it is protected", every_s=0.1)
             wait_until(lambda: self._oracle.heard > 20, 30, "it computes", every_s=0.1)
+            time.sleep(moment_s)
             self._bring_out()
             outcome = self._judge()
             self._note_times()
@@ -327,18 +344,18 @@ def compile_ros(build: Path) -> bool:
     return True
 
 
-def one_round(made: list[Cell], number: int, options: argparse.Namespace, programs: Path) -> None:
-    """Each of them once, under a sidecar of its own."""
+def make(runs: list[Cell], number: int, options: argparse.Namespace, programs: Path) -> None:
+    """One run of each element, some side by side, all under one sidecar of their own."""
     labels = {**LABELS, **dict(pair.split("=", 1) for pair in options.label)}
-    ros = any(cell.language == "ROS" for cell in made)
+    ros = any(cell.language == "ROS" for cell in runs)
     pool = concurrent.futures.ThreadPoolExecutor(options.parallel)
     with world(programs, labels, options.podman, ros=ros) as here, pool:
-        runs: dict[concurrent.futures.Future[str], Cell] = {}
-        for i, cell in enumerate(made):
+        made: dict[concurrent.futures.Future[str], Cell] = {}
+        for i, cell in enumerate(runs):
             run = Run(here, cell, f"avckpt-campaign-{os.getpid()}-{number}-{i}", options.seconds)
-            runs[pool.submit(run.outcome)] = cell
-        for done in concurrent.futures.as_completed(runs):
-            cell = runs[done]
+            made[pool.submit(run.outcome)] = cell
+        for done in concurrent.futures.as_completed(made):
+            cell = made[done]
             try:
                 cell.counted[done.result()] += 1
             except (OSError, CommandFailed, AvckptError, KeyError, subprocess.SubprocessError) as error:
@@ -352,6 +369,8 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=50)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--parallel", type=int, default=4)
+    parser.add_argument("--together", type=int, default=1, help="rounds under one sidecar")
+    parser.add_argument("--go-on", action="store_true", help="what --output has of --seconds and --label counts")
     parser.add_argument("--language", action="append", choices=sorted(LANGUAGES))
     parser.add_argument("--fault", action="append")
     parser.add_argument("--label", action="append", default=[], metavar="NAME=VALUE", help="another label of theirs")
@@ -365,10 +384,29 @@ def main() -> None:
         Path(build).chmod(0o755)
         made = cells(Path(build), set(options.language or LANGUAGES))
         made = [cell for cell in made if not options.fault or cell.fault in options.fault]
-        for number in range(options.runs):
-            one_round(made, number, options, Path(build))
+        if options.go_on:
+            take_up(made, options)
+        for number in itertools.count():
+            missing = [cell for cell in made for _ in range(min(cell.missing(options.runs), options.together))]
+            if not missing:
+                break
+            random.shuffle(missing)
+            make(missing, number, options, Path(build))
             write(options.output, made, options)
-            print(f"round {number + 1} of {options.runs}, {time.monotonic() - begun:.0f} s", file=sys.stderr)
+            runs = sum(cell.runs for cell in made)
+            print(f"{runs} of {options.runs * len(made)} runs, {time.monotonic() - begun:.0f} s", file=sys.stderr)
+
+
+def take_up(made: list[Cell], options: argparse.Namespace) -> None:
+    """What was counted before, under the same conditions."""
+    of = {(cell.fault, cell.language): cell for cell in made}
+    for found in json.loads(options.output.read_text()) if options.output.exists() else []:
+        cell = of.get((found["fault"], found["language"]))
+        if cell is not None and (found["seconds"], found["labels"]) == (options.seconds, options.label):
+            cell.counted = {outcome: found[outcome] for outcome in OUTCOMES}
+            cell.failed = found["not_made"]
+            cell.detected_s = [found["detected_max_s"]] if found["detected_max_s"] is not None else []
+            cell.restored_s = [found["restored_max_s"]] if found["restored_max_s"] is not None else []
 
 
 def write(path: Path, made: list[Cell], options: argparse.Namespace) -> None:
