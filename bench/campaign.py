@@ -43,6 +43,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import psutil
 from avckpt.cli.client import Client
 from avckpt.errors import AvckptError
 
@@ -65,6 +66,8 @@ ROWS_S = 0.1
 OUT_OF_MEMORY = "memory leak to the OOM killer"
 MEMORY = "150m"
 """Of a container that leaks."""
+SPINNING_CPUS = "0.2"
+"""Of a container with a livelock."""
 COMPILE = ("g++", "-O1", "-g", "-w", "-pthread", "-fstack-protector-all")
 """-w: compilers see some of the faults."""
 
@@ -257,8 +260,8 @@ class Run:
         try:
             if cell.language == "ROS":
                 self._world.podman.run("exec", "--detach", self._world.core, cell.command[0], "relay", port)
-            options = ("--memory", MEMORY, "--memory-swap", MEMORY) if cell.fault == OUT_OF_MEMORY else ()
-            self._world.start(self.name, cell.image, [*cell.command, cell.fault, port], options, protect=True)
+            command = [*cell.command, cell.fault, port]
+            self._world.start(self.name, cell.image, command, options_for(cell.fault), protect=True)
             wait_until(lambda: self._row().get("generations", 0) >= 2, 30, "it is protected", every_s=0.1)
             wait_until(lambda: self._oracle.heard > 20, 30, "it computes", every_s=0.1)
             time.sleep(moment_s)
@@ -269,6 +272,8 @@ class Run:
         finally:
             self._oracle.close()
             self._world.remove(self.name)
+            if cell.language == "ROS":
+                end_relay(port)
 
     def _bring_out(self) -> None:
         pid = int(self._row()["app_pid"])
@@ -306,6 +311,21 @@ class Run:
 
     def _row(self) -> dict[str, Any]:
         return self._world.rows.of(self.name)
+
+
+def options_for(fault: str) -> tuple[str, ...]:
+    """Of podman run: for faults that need a limit, and those that would take the CPUs of all others."""
+    if fault == OUT_OF_MEMORY:
+        return "--memory", MEMORY, "--memory-swap", MEMORY
+    return ("--cpus", SPINNING_CPUS) if "livelock" in fault else ()
+
+
+def end_relay(port: str) -> None:
+    """The one that sends to this port: a node hears for ever, and looks for its publisher meanwhile."""
+    for process in psutil.process_iter(["cmdline"]):
+        if (process.info["cmdline"] or [])[1:] == ["relay", port]:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.kill()
 
 
 def cells(build: Path, wanted: set[str]) -> list[Cell]:
