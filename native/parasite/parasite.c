@@ -244,6 +244,7 @@ static struct inj_thread *thread_of(struct inj_slot *slot, uint32_t i)
 #define TIMER_TRIES 100000
 #define CLOCK_MONOTONIC_ 1
 #define NS_PER_S INT64_C(1000000000)
+#define WATCHDOG_NS (60 * NS_PER_S) /* hardly one is set for longer */
 
 /* timer_create(2) with the id *id. On an older kernel the ids count up: those in between are
  * deleted. */
@@ -266,12 +267,19 @@ static long make_timer(uint64_t clock, uint64_t event, int32_t *id, int32_t want
 	return -17; /* EEXIST */
 }
 
-/* At the last moment: the remaining time shrinks during the restore. */
+/* At the last moment: the remaining time shrinks during the restore.
+ *
+ * Deadlines stay where they were, with one exception.  A timer that rings once, and soon, may be a
+ * watchdog, which the program sets anew all the time.  With its old deadline it would end a program
+ * that has gone back further than that before this could set it again, so it has the time that it had
+ * at the checkpoint.  Late by what was lost is what any timer may be. */
 static long set_timer(uint64_t nr, uint64_t timer, const struct inj_timer *was, uint64_t asked_ns)
 {
 	const int64_t unit = nr == __NR_setitimer ? 1000 : 1;
 	const int64_t interval = was->interval[0] * NS_PER_S + was->interval[1] * unit;
-	int64_t now[2], left = was->left[0] * NS_PER_S + was->left[1] * unit;
+	const int64_t had = was->left[0] * NS_PER_S + was->left[1] * unit;
+	const int64_t least = had < WATCHDOG_NS ? had : WATCHDOG_NS;
+	int64_t now[2], left = had;
 	struct inj_timer is;
 	long r = SYS2(__NR_clock_gettime, CLOCK_MONOTONIC_, now);
 
@@ -280,6 +288,8 @@ static long set_timer(uint64_t nr, uint64_t timer, const struct inj_timer *was, 
 	left -= now[0] * NS_PER_S + now[1] - (int64_t)asked_ns;
 	if (left <= 0 && interval > 0)
 		left = interval - -left % interval; /* in phase */
+	if (interval == 0 && left < least)
+		left = least;
 	if (left < unit)
 		left = unit; /* at once; 0 would be never */
 	is.interval[0] = was->interval[0];

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
@@ -24,3 +25,21 @@ def built(init_built: None, victims_built: Path) -> None:
 def test_timers(command: str, where: str, tmp_path: Path) -> None:
     with Victim(f"{command} {where}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 60, (0.005, 0.1))
+
+
+@pytest.mark.parametrize("kind", ["alarm", "timer"])
+def test_a_watchdog_has_its_time_again(kind: str, tmp_path: Path) -> None:
+    """The state gone back to is older than the time after which it kills."""
+    watched_s = 1.0
+    with (
+        Victim(f"alarm {watched_s * 1000:.0f} {kind}", tmp_path) as victim,
+        GuardProcess(config(60), [victim.pid]) as guard,
+    ):
+        guard.checkpoint()
+        for _ in range(3):
+            time.sleep(watched_s * 1.5)
+            since = guard.mark()
+            victim.kill_app()
+            guard.wait("restored", since=since)
+            victim.wait_beats(20)
+            assert [event["kind"] for event in guard.events[since:]].count("restored") == 1

@@ -3,6 +3,9 @@
  * alarm MS: sets alarms and one-shot POSIX timers again and again, MS from now, with
  * handlers, and waits for them: none may come early or late by more than a checkpoint
  * or a restore takes.
+ *
+ * alarm MS alarm|timer: one of the two is its watchdog.  It sets it again every 5 ms, and no
+ * handler keeps the signal from killing it.
  */
 #include <signal.h>
 #include <sys/time.h>
@@ -20,29 +23,57 @@ static void on_alarm(int sig)
 	rung = 1;
 }
 
+static void set_alarm(uint64_t ms)
+{
+	const struct itimerval in = { { 0, 0 }, { (time_t)(ms / 1000), (long)(ms % 1000 * 1000) } };
+
+	must(!setitimer(ITIMER_REAL, &in, NULL), "setitimer");
+}
+
+static void set_timer(timer_t timer, uint64_t ms)
+{
+	const struct itimerspec in = { { 0, 0 },
+				       { (time_t)(ms / 1000), (long)(ms % 1000 * 1000000) } };
+
+	must(!timer_settime(timer, 0, &in, NULL), "timer_settime");
+}
+
+static void watch(const char *what, timer_t timer, uint64_t ms)
+{
+	for (;;) {
+		if (!strcmp(what, "alarm"))
+			set_alarm(ms);
+		else
+			set_timer(timer, ms);
+		beat();
+		usleep(5000);
+	}
+}
+
 int main(int argc, char **argv)
 {
 	struct sigaction act = { .sa_handler = on_alarm };
 	uint64_t ms, lap;
 	timer_t timer;
 
-	victim_start(&argc, argv, 1, "MS");
+	victim_start(&argc, argv, 1, "MS [alarm|timer]");
 	ms = (uint64_t)atol(argv[1]);
-	sigaction(SIGALRM, &act, NULL);
 	must(!timer_create(CLOCK_MONOTONIC, NULL, &timer), "timer_create");
+	if (argc > 2) {
+		victim_ready();
+		watch(argv[2], timer, ms);
+	}
+	sigaction(SIGALRM, &act, NULL);
 	victim_ready();
 	for (lap = 0;; lap++) {
-		const struct timespec in = { (time_t)(ms / 1000), (long)(ms % 1000 * 1000000) };
-		const struct itimerval alarm_in = { { 0, 0 }, { in.tv_sec, in.tv_nsec / 1000 } };
-		const struct itimerspec timer_in = { { 0, 0 }, in };
 		uint64_t now;
 
 		rung = 0;
 		due_ns = now_ns() + ms * 1000000;
 		if (lap % 2)
-			must(!setitimer(ITIMER_REAL, &alarm_in, NULL), "setitimer");
+			set_alarm(ms);
 		else
-			must(!timer_settime(timer, 0, &timer_in, NULL), "timer_settime");
+			set_timer(timer, ms);
 		while (!rung) {
 			beat();
 			usleep(500);
