@@ -74,6 +74,15 @@ def test_who_sent_it() -> None:
     assert (crash.code, crash.sender, crash.sender_pid) == ("SI_KERNEL", "kernel", 0)
 
 
+def test_a_kill_does_not_tell_the_code_of_the_signal_behind_it() -> None:
+    """alarm(2) sends SI_KERNEL, and nobody saw it being sent."""
+    death = Death(5, {5: delivery(5, 9)})
+    assert crash_of("SIGALRM", death.fatal(14), death, None).code == ""
+    terminated = Death(5, {5: delivery(5, 9)}, [Sent(90, 15, 0, 77, 5, "app")])
+    crash = crash_of("SIGTERM", terminated.fatal(15), terminated, None)
+    assert (crash.code, crash.sender_pid) == ("SI_USER", 77)
+
+
 def test_names_of_codes() -> None:
     assert code_name("SIGFPE", 1) == "FPE_INTDIV"
     assert code_name("SIGSEGV", -6) == "SI_TKILL"

@@ -55,7 +55,7 @@ class Crash:
     """What is known of a death.  Empty or 0: it is not known, or there is no such thing."""
 
     signal: str = said("name of the signal that it died of; empty: it ended by itself")
-    code: str = said("`si_code` of it: SEGV_MAPERR, FPE_INTDIV, SI_USER (kill), SI_TKILL (raise, abort), ...")
+    code: str = said("`si_code` of it: SEGV_MAPERR, SI_USER (kill), SI_TKILL (abort), ...; empty: not known")
     fault: str = said("address that could not be accessed, in hex digits; where the kernel's log has it")
     tid: int = said("thread that was hit, in the sidecar's PID namespace", 0)
     thread: str = said("name of the thread")
@@ -112,12 +112,14 @@ def crash_of(signal: str, hit: Delivery | None, death: Death, fault: Fault | Non
     # The one that was answered by the death is the last before it.
     sent = [each for each in death.sent if signal_name(each.signal) == signal and each.at_ns <= hit.at_ns]
     last = max(sent, key=lambda each: each.at_ns, default=None)
-    code = last.code if last is not None and (hit.code == 0 or signal_name(hit.signal) != signal) else hit.code
+    # One that leaves no core is delivered as a SIGKILL, which does not tell its code.
+    delivered = hit.code if signal_name(hit.signal) == signal else None
+    code = last.code if last is not None and not delivered else delivered
     outside = last is not None and last.sender_pid not in (0, death.pid) and code in _SENT_BY_USERS
     name = fault.thread if fault is not None else next((each.thread for each in sent if each.tid == hit.tid), "")
     return Crash(
         signal=signal,
-        code=code_name(signal, code),
+        code="" if code is None else code_name(signal, code),
         fault=f"{fault.address:#x}" if fault is not None and fault.address is not None else "",
         tid=hit.tid,
         thread=name,
