@@ -385,6 +385,7 @@ def test_a_watched_file_that_is_gone_is_told(tmp_path: Path) -> None:
         assert "not all of what it watched" in restored(victim, guard)["error"]["detail"]
 
 
+@pytest.mark.shared_machine("once the PID was taken for seconds on a busy one, nobody knows by whom: the message tells")
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("scenario", ["messages", "flight", "shut", "pidfds", "child", "full"])
 def test_sockets(scenario: str, where: str, tmp_path: Path) -> None:

@@ -5,12 +5,15 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import socket
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 from avckpt.guard import Images, Tcp
 
@@ -294,3 +297,35 @@ def test_restores_are_used_up(tmp_path: Path) -> None:
         victim.kill_app()
         assert guard.wait("gave_up")["reason"] == "limit"
         assert victim.end() == 128 + signal.SIGKILL
+
+
+@pytest.mark.shared_machine("init waits two seconds for its guard, which is stopped until somebody else has forked")
+@pytest.mark.parametrize("command", ["idle 1 4", "tree 3"])
+def test_who_has_the_pid_is_told(command: str, tmp_path: Path) -> None:
+    """Somebody who takes it before the guard does."""
+    take = "read number; echo $((number - 1)) >/proc/sys/kernel/ns_last_pid; sleep 60 & echo $!; wait"
+    with Victim(command, tmp_path) as victim, GuardProcess(config(60), [victim.pid]) as guard:
+        guard.checkpoint()
+        number, dead = inside(victim.app), psutil.Process(victim.app)
+        thief = subprocess.Popen(
+            ["nsenter", "--pid", f"--target={victim.pid}", "sh", "-c", take],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        assert thief.stdin is not None
+        assert thief.stdout is not None
+        try:
+            os.kill(guard.pid, signal.SIGSTOP)
+            victim.kill_app()
+            wait_until(lambda: not dead.is_running(), 10, "init has reaped it")
+            print(number, file=thief.stdin, flush=True)
+            assert int(thief.stdout.readline()) == number
+            os.kill(guard.pid, signal.SIGCONT)
+            error = guard.wait("gave_up")["error"]["detail"]
+        finally:
+            os.kill(guard.pid, signal.SIGCONT)
+            os.killpg(thief.pid, signal.SIGKILL)
+            thief.wait()
+        assert re.fullmatch(r"the PID is taken by process \d+ \(sleep, state S\)", error)

@@ -291,6 +291,10 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 		/* Perhaps because the new process or the spare was killed, or the spare, or what is
 		 * left of somebody dead, was one process too many.  The template is still good. */
 		guard_release_oldest_remains(guard, 0);
+		/* Or because what died while it was stopped still has the PID's group: nobody else
+		 * can reap it. */
+		(void)guard_tend_stragglers(guard);
+		guard_reap_unknown(guard);
 		if (whole && !again) {
 			generation->spare.unwanted = generation->spare.pid &&
 						     failed.errnum == EAGAIN;

@@ -4,6 +4,7 @@
  * its memory to one (spare.c), which restores itself (parasite.c, inj_restore) and waits until
  * everything is ready; then all its threads are released at once.  The new process is not traced.
  */
+#include <dirent.h>
 #include <errno.h>
 #include <linux/futex.h>
 #include <poll.h>
@@ -166,6 +167,37 @@ static int describe_failure(const struct parasite *parasite, const struct inj_sl
 		    "thread %d could not be put back", slot->error_tid);
 }
 
+/* A number is taken as long as a process has it, or as its group or session (kernel/pid.c,
+ * __change_pid()), which a zombie keeps. */
+static int fail_taken(pid_t init, pid_t number, struct avc_error *err)
+{
+	char inside[64] = "", its[64];
+	DIR *proc = proc_link(init, "ns/pid", inside, sizeof inside) < 0 ? NULL : opendir("/proc");
+	struct proc_status status;
+	struct proc_stat stat;
+	struct dirent *entry;
+	pid_t pid = 0;
+
+	while (!pid && proc && (entry = readdir(proc))) {
+		const pid_t other = (pid_t)atoi(entry->d_name);
+
+		if (other > 0 && proc_link(other, "ns/pid", its, sizeof its) >= 0 &&
+		    !strcmp(its, inside) && !proc_status(other, &status) &&
+		    (status.inside == number || status.group == number || status.session == number))
+			pid = other;
+	}
+	if (proc)
+		closedir(proc);
+	if (!pid || proc_stat(pid, &stat))
+		return fail(err, AVC_KERNEL, EEXIST, number, "restore", "clone",
+			    "the PID is taken by somebody else");
+	return fail(err, AVC_KERNEL, EEXIST, number, "restore", "clone",
+		    "the PID is taken by process %d (%s, state %c)%s", pid, stat.name, stat.state,
+		    status.inside == number  ? ""
+		    : status.group == number ? " as its group"
+					     : " as its session");
+}
+
 /* Forks until the PID is the app's; in a shared PID namespace other processes may fork in
  * between. */
 static int rebuild(struct restore *restore, struct avc_error *err)
@@ -207,8 +239,7 @@ static int rebuild(struct restore *restore, struct avc_error *err)
 		if (slot->state == INJ_FAILED)
 			return describe_failure(parasite, slot, err);
 	}
-	return fail(err, AVC_KERNEL, EEXIST, slot->pid, "restore", "clone",
-		    "the PID is taken by somebody else");
+	return fail_taken(restore->channel->init, slot->pid, err);
 }
 
 /* ---- one of several ---------------------------------------------------------------- */
