@@ -256,7 +256,6 @@ class Run:
     def outcome(self) -> str:
         """Makes it.  Raises TimeoutError, OSError or CommandFailed when the program could not be protected."""
         cell, port = self._cell, str(self._oracle.port)
-        moment_s = random.uniform(0, MOMENT_S)
         try:
             if cell.language == "ROS":
                 self._world.podman.run("exec", "--detach", self._world.core, cell.command[0], "relay", port)
@@ -264,7 +263,7 @@ class Run:
             self._world.start(self.name, cell.image, command, options_for(cell.fault), protect=True)
             wait_until(lambda: self._row().get("generations", 0) >= 2, 30, "it is protected", every_s=0.1)
             wait_until(lambda: self._oracle.heard > 20, 30, "it computes", every_s=0.1)
-            time.sleep(moment_s)
+            time.sleep(random.uniform(0, MOMENT_S))
             self._bring_out()
             outcome = self._judge()
             self._note_times()

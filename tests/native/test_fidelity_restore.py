@@ -303,7 +303,11 @@ def test_restores_are_used_up(tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", ["idle 1 4", "tree 3"])
 def test_who_has_the_pid_is_told(command: str, tmp_path: Path) -> None:
     """Somebody who takes it before the guard does."""
-    take = "read number; echo $((number - 1)) >/proc/sys/kernel/ns_last_pid; sleep 60 & echo $!; wait"
+    # Again, while it is still the group of the others of the tree, which end by themselves.
+    take = (
+        "read number; until [ $! = $number ]; do kill $!; echo $((number - 1)) >/proc/sys/kernel/ns_last_pid; "
+        "sleep 60 & done 2>/dev/null; echo $!; wait"
+    )
     with Victim(command, tmp_path) as victim, GuardProcess(config(60), [victim.pid]) as guard:
         guard.checkpoint()
         number, dead = inside(victim.app), psutil.Process(victim.app)

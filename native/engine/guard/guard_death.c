@@ -213,6 +213,16 @@ static void ready_helper(struct avc_guard *guard)
 	guard->helper_for = newest->number;
 }
 
+/* If the app is killed during a checkpoint, init cannot reap a process before we have reaped those
+ * of its threads that are our tracees. */
+static void reap_tracees(void *arg)
+{
+	struct avc_guard *guard = arg;
+
+	(void)guard_tend_stragglers(guard);
+	guard_reap_unknown(guard);
+}
+
 bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 		      enum avc_reason reason, uint32_t had, struct avc_error *error)
 {
@@ -291,10 +301,7 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 		/* Perhaps because the new process or the spare was killed, or the spare, or what is
 		 * left of somebody dead, was one process too many.  The template is still good. */
 		guard_release_oldest_remains(guard, 0);
-		/* Or because what died while it was stopped still has the PID's group: nobody else
-		 * can reap it. */
-		(void)guard_tend_stragglers(guard);
-		guard_reap_unknown(guard);
+		reap_tracees(guard); /* or because one of them still has the PID, or its group */
 		if (whole && !again) {
 			generation->spare.unwanted = generation->spare.pid &&
 						     failed.errnum == EAGAIN;
@@ -331,16 +338,6 @@ void guard_hold_all(struct avc_guard *guard)
 			guard->dying_until_ns = now_ns() + DYING_NS;
 	}
 	last_pid_unlock(guard->channel.numbers_fd);
-}
-
-/* If the app is killed during a checkpoint, init cannot reap a process before we have reaped those
- * of its threads that are our tracees. */
-static void reap_tracees(void *arg)
-{
-	struct avc_guard *guard = arg;
-
-	(void)guard_tend_stragglers(guard);
-	guard_reap_unknown(guard);
 }
 
 /* The OOM killer also kills processes that share its victim's memory: the holder, too.  Until that
