@@ -39,11 +39,10 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import psutil
 from avckpt.cli.client import Client
 from avckpt.errors import AvckptError
 
@@ -61,7 +60,9 @@ MOMENT_S = 1.0
 POISON_EVERY_S = 1.0
 """Poison comes back: whoever sent it has had no answer."""
 SILENT_S = 2.0
-ROWS_S = 0.1
+LOOK_S = 0.2
+"""Between two looks at a run."""
+ROWS_S = 0.25
 """So old may be what the sidecar has said of all runs: each asking for itself would keep it busy."""
 OUT_OF_MEMORY = "memory leak to the OOM killer"
 MEMORY = "150m"
@@ -204,12 +205,21 @@ class World:
     core: str
     """The container of ROS's master; empty: there is none."""
     core_port: int
+    core_pid: str = ""
+
+    def relay(self, program: str, port: int) -> subprocess.Popen[bytes]:
+        """A node that is not protected, and sends to `port` what it hears, in the master's container."""
+        command = ("nsenter", "--mount", "--target", self.core_pid, program, "relay", str(port))
+        return subprocess.Popen(command, env={**os.environ, **self._ros()}, stdout=subprocess.DEVNULL)
+
+    def _ros(self) -> dict[str, str]:
+        return {"ROS_MASTER_URI": f"http://127.0.0.1:{self.core_port}", "ROS_IP": "127.0.0.1"}
 
     def start(self, name: str, image: str, command: Sequence[str], options: Sequence[str], *, protect: bool) -> str:
         """A container; its id.  Raises CommandFailed."""
         labels = {key: value for key, value in self.labels.items() if protect}
         words = [word for key, value in labels.items() for word in ("--label", f"{key}={value}")]
-        env = ("--env", f"ROS_MASTER_URI=http://127.0.0.1:{self.core_port}", "--env", "ROS_IP=127.0.0.1")
+        env = [word for key, value in self._ros().items() for word in ("--env", f"{key}={value}")]
         return self.podman.run(
             *("run", "--detach", "--pull=never", "--network=host", "--volume", f"{self.programs}:/faults:ro"),
             *("--name", name, *words, *env, *self.options, *options, image, *command),
@@ -236,6 +246,8 @@ def world(programs: Path, labels: dict[str, str], options: list[str], *, ros: bo
         try:
             if ros:
                 made.start(core, ROS_IMAGE, ["rosmaster", "--core", "-p", str(port)], [], protect=False)
+                pid = made.podman.run("inspect", "--format", "{{.State.Pid}}", core).stdout.strip()
+                made = replace(made, core_pid=pid)
             yield made
         finally:
             if ros:
@@ -255,11 +267,10 @@ class Run:
 
     def outcome(self) -> str:
         """Makes it.  Raises TimeoutError, OSError or CommandFailed when the program could not be protected."""
-        cell, port = self._cell, str(self._oracle.port)
+        cell, port = self._cell, self._oracle.port
+        relay = self._world.relay(cell.command[0], port) if cell.language == "ROS" else None
         try:
-            if cell.language == "ROS":
-                self._world.podman.run("exec", "--detach", self._world.core, cell.command[0], "relay", port)
-            command = [*cell.command, cell.fault, port]
+            command = [*cell.command, cell.fault, str(port)]
             self._world.start(self.name, cell.image, command, options_for(cell.fault), protect=True)
             wait_until(lambda: self._row().get("generations", 0) >= 2, 30, "it is protected", every_s=0.1)
             wait_until(lambda: self._oracle.heard > 20, 30, "it computes", every_s=0.1)
@@ -271,8 +282,9 @@ class Run:
         finally:
             self._oracle.close()
             self._world.remove(self.name)
-            if cell.language == "ROS":
-                end_relay(port)
+            if relay is not None:
+                relay.kill()
+                relay.wait()
 
     def _bring_out(self) -> None:
         pid = int(self._row()["app_pid"])
@@ -283,7 +295,7 @@ class Run:
         poisoned = time.monotonic()
         died = False
         while time.monotonic() < end:
-            time.sleep(0.05)
+            time.sleep(LOOK_S)
             row = self._row()
             if row["state"] == "ended":
                 return "wrong" if self._oracle.wrong else "cold"
@@ -317,14 +329,6 @@ def options_for(fault: str) -> tuple[str, ...]:
     if fault == OUT_OF_MEMORY:
         return "--memory", MEMORY, "--memory-swap", MEMORY
     return ("--cpus", SPINNING_CPUS) if "livelock" in fault else ()
-
-
-def end_relay(port: str) -> None:
-    """The one that sends to this port: a node hears for ever, and looks for its publisher meanwhile."""
-    for process in psutil.process_iter(["cmdline"]):
-        if (process.info["cmdline"] or [])[1:] == ["relay", port]:
-            with contextlib.suppress(psutil.NoSuchProcess):
-                process.kill()
 
 
 def cells(build: Path, wanted: set[str]) -> list[Cell]:
