@@ -161,7 +161,7 @@ bench-trees: setup-build ## measure freeze and restore of process trees beside f
 campaign: setup ## inject faults into protected containers in C++, Python, Go and ROS: what becomes of them (RUNS=50 WINDOW=60; hours)
 	@scripts/setup-campaign.sh
 	@scripts/setup-ros.sh
-	@$(VENV)/python -m bench.campaign --runs $(or $(RUNS),50) --seconds $(or $(WINDOW),60) --together 2 --go-on --label avckpt.interval=1s
+	@$(VENV)/python -m bench.campaign --runs $(or $(RUNS),50) --seconds $(or $(WINDOW),60) --parallel 40 --go-on --label avckpt.interval=1s
 	@$(VENV)/python -m bench.campaign_show
 
 clean: ## remove what was built here (images and the base's cache stay)

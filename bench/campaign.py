@@ -60,6 +60,8 @@ MOMENT_S = 1.0
 POISON_EVERY_S = 1.0
 """Poison comes back: whoever sent it has had no answer."""
 SILENT_S = 2.0
+TOLD = 100
+"""After so many runs a line says how far it is."""
 LOOK_S = 0.2
 """Between two looks at a run."""
 ROWS_S = 0.25
@@ -261,15 +263,16 @@ class Run:
         self._world = world
         self._cell = cell
         self._seconds = seconds
-        self._begun = time.time()
         self.name = name
-        self._oracle = Oracle()
 
     def outcome(self) -> str:
         """Makes it.  Raises TimeoutError, OSError or CommandFailed when the program could not be protected."""
-        cell, port = self._cell, self._oracle.port
-        relay = self._world.relay(cell.command[0], port) if cell.language == "ROS" else None
+        self._begun = time.time()
+        self._oracle = Oracle()
+        cell, port, relay = self._cell, self._oracle.port, None
         try:
+            if cell.language == "ROS":
+                relay = self._world.relay(cell.command[0], port)
             command = [*cell.command, cell.fault, str(port)]
             self._world.start(self.name, cell.image, command, options_for(cell.fault), protect=True)
             wait_until(lambda: self._row().get("generations", 0) >= 2, 30, "it is protected", every_s=0.1)
@@ -367,23 +370,29 @@ def compile_ros(build: Path) -> bool:
     return True
 
 
-def make(runs: list[Cell], number: int, options: argparse.Namespace, programs: Path) -> None:
-    """One run of each element, some side by side, all under one sidecar of their own."""
+def make(cells: list[Cell], number: int, options: argparse.Namespace, programs: Path) -> None:
+    """What is missing, those with the fewest runs first, some side by side, all under one sidecar of their own."""
     labels = {**LABELS, **dict(pair.split("=", 1) for pair in options.label)}
-    ros = any(cell.language == "ROS" for cell in runs)
+    missing = [(cell.runs + i, random.random(), cell) for cell in cells for i in range(cell.missing(options.runs))]
+    missing.sort(key=lambda each: each[:2])
+    ros = any(cell.language == "ROS" for cell in cells)
+    begun = time.monotonic()
     pool = concurrent.futures.ThreadPoolExecutor(options.parallel)
     with world(programs, labels, options.podman, ros=ros) as here, pool:
         made: dict[concurrent.futures.Future[str], Cell] = {}
-        for i, cell in enumerate(runs):
+        for i, (_, _, cell) in enumerate(missing):
             run = Run(here, cell, f"avckpt-campaign-{os.getpid()}-{number}-{i}", options.seconds)
             made[pool.submit(run.outcome)] = cell
-        for done in concurrent.futures.as_completed(made):
+        for i, done in enumerate(concurrent.futures.as_completed(made), 1):
             cell = made[done]
             try:
                 cell.counted[done.result()] += 1
             except (OSError, CommandFailed, AvckptError, KeyError, subprocess.SubprocessError) as error:
                 cell.failed += 1
                 print(f"{cell.language}, {cell.fault}: not made: {str(error)[-300:]}", file=sys.stderr)
+            write(options.output, cells, options)
+            if i % TOLD == 0:
+                print(f"{i} of {len(missing)} runs, {time.monotonic() - begun:.0f} s", file=sys.stderr)
 
 
 def main() -> None:
@@ -392,7 +401,6 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=50)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--parallel", type=int, default=4)
-    parser.add_argument("--together", type=int, default=1, help="rounds under one sidecar")
     parser.add_argument("--go-on", action="store_true", help="what --output has of --seconds and --label counts")
     parser.add_argument("--language", action="append", choices=sorted(LANGUAGES))
     parser.add_argument("--fault", action="append")
@@ -402,7 +410,6 @@ def main() -> None:
     )
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
-    begun = time.monotonic()
     with tempfile.TemporaryDirectory() as build:
         Path(build).chmod(0o755)
         made = cells(Path(build), set(options.language or LANGUAGES))
@@ -410,14 +417,9 @@ def main() -> None:
         if options.go_on:
             take_up(made, options)
         for number in itertools.count():
-            missing = [cell for cell in made for _ in range(min(cell.missing(options.runs), options.together))]
-            if not missing:
+            if not any(cell.missing(options.runs) for cell in made):
                 break
-            random.shuffle(missing)
-            make(missing, number, options, Path(build))
-            write(options.output, made, options)
-            runs = sum(cell.runs for cell in made)
-            print(f"{runs} of {options.runs * len(made)} runs, {time.monotonic() - begun:.0f} s", file=sys.stderr)
+            make(made, number, options, Path(build))
 
 
 def take_up(made: list[Cell], options: argparse.Namespace) -> None:
@@ -433,9 +435,11 @@ def take_up(made: list[Cell], options: argparse.Namespace) -> None:
 
 
 def write(path: Path, made: list[Cell], options: argparse.Namespace) -> None:
-    """The results so far."""
+    """The results so far; the file is whole at every instant."""
     found = [{**cell.to_json(), "seconds": options.seconds, "labels": options.label} for cell in made]
-    path.write_text(json.dumps(found, indent=1) + "\n")
+    new = path.with_suffix(".new")
+    new.write_text(json.dumps(found, indent=1) + "\n")
+    new.replace(path)
 
 
 if __name__ == "__main__":
