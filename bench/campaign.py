@@ -59,7 +59,8 @@ MOMENT_S = 1.0
 """So long after the program is protected, at most, comes the signal: at no particular time since a checkpoint."""
 POISON_EVERY_S = 1.0
 """Poison comes back: whoever sent it has had no answer."""
-SILENT_S = 2.0
+SILENT_S = 10.0
+"""So long at the end: where more runs than CPUs wait, one may be silent for seconds."""
 TOLD = 100
 """After so many runs a line says how far it is."""
 LOOK_S = 0.2
@@ -320,6 +321,8 @@ class Run:
         if self._oracle.wrong:
             return "wrong"
         if time.monotonic() - self._oracle.last_s > SILENT_S:
+            if row["restores"]:
+                print(f"{self._cell.language}, {self._cell.fault}: stuck: {tasks(row['app_pid'])}", file=sys.stderr)
             return "stuck"
         return "unharmed" if not row["restores"] else "recovered" if row["restores"] == 1 else "recrashed"
 
@@ -332,6 +335,17 @@ class Run:
 
     def _row(self) -> dict[str, Any]:
         return self._world.rows.of(self.name)
+
+
+def tasks(pid: int) -> str:
+    """What each thread of a process waits for: one that was restored and is stuck is a defect of ours."""
+    found = []
+    for task in sorted(Path(f"/proc/{pid}/task").glob("*")):
+        with contextlib.suppress(OSError):
+            state = (task / "stat").read_text().rpartition(")")[2].split()[0]
+            texts = [(task / name).read_text().strip() for name in ("comm", "wchan", "syscall")]
+            found.append(f"{task.name} {state} {' '.join(texts)}")
+    return "; ".join(found)
 
 
 def options_for(fault: str) -> tuple[str, ...]:
