@@ -2,7 +2,13 @@
  *
  * Descriptors: what the app has open at one instant, and how it is restored.
  *
- *   files.c         reads a table
+ *   files.c         a table
+ *   files_look.c    reads it
+ *   files_descriptor.c ... one descriptor
+ *   files_inherited.c ... what a child shares with its parent
+ *   files_shared.c  ... which descriptors are of one description
+ *   files_contents.c ... what is in pipes and sockets
+ *   files_capture.c when a checkpoint reads what
  *   files_info.c    what /proc/PID/fdinfo says
  *   files_state.c   what is behind a descriptor: offsets, counts, timers, bytes, locks
  *   files_messages.c contents of Unix sockets, and which ends are shut down
@@ -10,7 +16,7 @@
  *   files_unix.c    names of Unix sockets
  *   files_make.c    reopens and recreates what is lost
  *   files_restore.c compares two tables and makes the one the other
- *   files_heirs.c   what a child shares with its parent
+ *   files_heirs.c   checks what a child shares with its parent
  *   files_family.c  all tables of an app: what its processes share
  *   files_calls.c   what the restored process has to do itself
  *   files_watches.c inotify
@@ -354,6 +360,10 @@ enum files_depth {
 
 /* files.c */
 struct files *files_new(uint32_t room);
+struct file *files_find(const struct files *files, int fd);
+bool files_same_object(const struct file *a, const struct file *b);
+
+/* files_look.c */
 /* Whose they are. */
 struct files_owner {
 	pid_t pid;
@@ -366,15 +376,17 @@ struct files_owner {
 /* `files->parent` may be set. */
 int files_look(struct files *files, const struct files_owner *owner, enum files_depth depth,
 	       struct files *known, struct avc_error *err) warn_unused;
+/* Sorts them. */
+void files_missing_sort(struct files_missing *missing);
+
+/* files_capture.c */
 /* In a freeze: the table, but for sizes and contents. */
 static inline bool files_are_read(const struct image *image)
 {
 	return image->process && !image->files_error.code;
 }
-/* Sorts them. */
-void files_missing_sort(struct files_missing *missing);
-struct file *files_find(const struct files *files, int fd);
-bool files_same_object(const struct file *a, const struct file *b);
+
+/* files_shared.c */
 /* Finds out which of them are of the same open file description: `first` is the first of
  * those.  They are sorted anew. */
 struct files_held {

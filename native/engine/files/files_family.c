@@ -67,7 +67,7 @@ static pid_t inside_of(const struct image *image, uint32_t images, pid_t pid)
 	return 0;
 }
 
-/* Pidfds and owners: what the process itself is called is known already (files.c). */
+/* Pidfds and owners: what the process itself is called is known already (files_capture.c). */
 static void name_others(const struct image *image, uint32_t images, struct files *files)
 {
 	for (uint32_t i = 0; files && i < files->count; i++) {

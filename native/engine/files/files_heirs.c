@@ -2,8 +2,8 @@
  *
  * Heirs: descriptors that a child shares with its parent, under the same number.  There may be as
  * many as processes times the descriptors of the first.  So a freeze assumes that those that occur
- * once in a child are unchanged (files.c, walk_frozen()), and does not even list them for each child
- * (leave_heirs()); and the look before it assumes that they are as in the checkpoint before
+ * once in a child are unchanged (files_look.c, walk_frozen()), and does not even list them for each child
+ * (look_leave_heirs()); and the look before it assumes that they are as in the checkpoint before
  * (was_parents()).  Both are checked afterwards, in the templates: the one comparison for each heir.
  *
  * A child that has replaced one cannot get it back unnoticed, except by exchanging two of them, and

@@ -207,7 +207,7 @@ static int is_awake(pid_t tid, void *arg)
 	return p && p[1] == ' ' && p[2] == 'R' ? -1 : 0;
 }
 
-/* Takes duplicates of a running app's sockets, which cost something (files.c): only for a stream of
+/* Takes duplicates of a running app's sockets, which cost something (files_descriptor.c): only for a stream of
  * messages (avckpt.tcp=messages). */
 static bool is_in_message(const struct process *process)
 {

@@ -235,7 +235,7 @@ struct process {
 	uint32_t main_filters; /* ... of the main process                         */
 	struct chains *chains; /* ... of its threads (state/filters.c)            */
 	pid_t init;            /* avckpt-init                                      */
-	struct files *files_before, *files_image; /* files.c                   */
+	struct files *files_before, *files_image; /* files_capture.c           */
 	uint32_t files_seen;
 	/* By number: found to be the parent's before the first look; allocated, NULL: not known. */
 	uint8_t *heirs_likely;

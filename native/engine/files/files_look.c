@@ -1,0 +1,261 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Reads a table of descriptors (files.h).
+ *
+ * A checkpoint reads it twice: before the freeze everything, names included, while the app runs;
+ * and during the freeze the state of that instant, while the kernel clones.  A descriptor that has
+ * been replaced in between is read in full again.
+ */
+#include <fcntl.h>
+#include <linux/major.h>
+#include <stdlib.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <sys/sysmacros.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "files_look.h"
+
+#define FUSE_MINOR 229 /* include/linux/miscdevice.h                                   */
+/* So many new sockets of a process are read in the freeze, where each makes it longer by 2 us, or by
+ * some 20 if it could be recreated. */
+#define SOCKETS_LATER 128
+
+struct linux_dirent64 {
+	uint64_t d_ino;
+	int64_t d_off;
+	unsigned short d_reclen;
+	unsigned char d_type;
+	char d_name[];
+};
+
+static int by_object(const void *a, const void *b)
+{
+	const struct file *x = *(const struct file *const *)a, *y = *(const struct file *const *)b;
+
+	if (x->dev != y->dev)
+		return x->dev < y->dev ? -1 : 1;
+	return (x->ino > y->ino) - (x->ino < y->ino);
+}
+
+void files_missing_sort(struct files_missing *missing)
+{
+	if (missing->count)
+		qsort(missing->file, missing->count, sizeof(void *), by_object);
+}
+
+/* A program may have opened thousands since, which only have to be closed. */
+static bool is_of_interest(const struct look *look, const char *name)
+{
+	const struct files_missing *missing = look->files->missing;
+	struct file key = { 0 };
+	const struct file *wanted = &key;
+	struct statx st;
+
+	if (!missing || files_find(look->known, atoi(name)))
+		return true;
+	if (!missing->count || statx(look->fd_dir, name, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT,
+				     STATX_TYPE | STATX_INO, &st))
+		return false;
+	key.dev = makedev(st.stx_dev_major, st.stx_dev_minor);
+	key.ino = st.stx_ino;
+	return (missing->port && S_ISSOCK(st.stx_mode)) ||
+	       bsearch(&wanted, missing->file, missing->count, sizeof wanted, by_object);
+}
+
+static int walk_known(struct look *look, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < look->known->count; i++)
+		if (look_at_descriptor(look, look->known->file[i].fd, err))
+			return -1;
+	return 0;
+}
+
+static int walk(struct look *look, uint32_t seen, struct avc_error *err)
+{
+	char buf[16384] __attribute__((aligned(8)));
+
+	for (;;) {
+		const long n = syscall(SYS_getdents64, look->fd_dir, buf, sizeof buf);
+
+		if (n < 0)
+			return fail_errno(err, look->pid, "look at descriptors", "getdents64",
+					  "it has ended");
+		if (n == 0)
+			return 0;
+		for (long at = 0; at < n;) {
+			const struct linux_dirent64 *entry = (struct linux_dirent64 *)(buf + at);
+
+			at += entry->d_reclen;
+			if (entry->d_name[0] != '.' && is_of_interest(look, entry->d_name) &&
+			    !files_find_among(look->files, seen, atoi(entry->d_name)) &&
+			    look_at_descriptor(look, atoi(entry->d_name), err))
+				return -1;
+		}
+	}
+}
+
+/* How many it has, since Linux 6.2. */
+static int64_t size_of_table(const struct look *look)
+{
+	struct stat st;
+
+	return fstat(look->fd_dir, &st) ? -1 : st.st_size;
+}
+
+/* Most have what they had before, or what their parent has; and to list a table takes longer than to
+ * look for those. */
+static int walk_before(struct look *look, struct avc_error *err)
+{
+	const struct files *likely = look->known ? look->known : look->files->parent;
+
+	for (uint32_t i = 0; likely && i < likely->count; i++)
+		if (look_at_descriptor(look, likely->file[i].fd, err))
+			return -1;
+	return size_of_table(look) == look->files->count ? 0 : walk(look, look->files->count, err);
+}
+
+int look_at_place(struct look *look, uint32_t i, bool *same, struct avc_error *err)
+{
+	struct files *files = look->files;
+
+	files->count = i;
+	if (look_at_descriptor(look, look->known->file[i].fd, err))
+		return -1;
+	if (files->count == i)
+		files->file[i].fd = -1; /* it has been closed             */
+	*same &= files->count > i && files->file[i].known;
+	return 0;
+}
+
+static int look_at_heirs(struct look *look, bool *same, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < look->known->count; i++)
+		if (look->known->file[i].heir && look_at_place(look, i, same, err))
+			return -1;
+	return 0;
+}
+
+/* Whether all others still exist. */
+static int look_at_own(struct look *look, bool *same, struct avc_error *err)
+{
+	*same = true;
+	for (uint32_t i = 0; i < look->known->own_count; i++)
+		if (look_at_place(look, look->known->own[i], same, err))
+			return -1;
+	return 0;
+}
+
+static void close_gaps(struct files *files, uint32_t count)
+{
+	files->count = 0;
+	for (uint32_t i = 0; i < count; i++)
+		if (files->file[i].fd >= 0)
+			files->file[files->count++] = files->file[i];
+}
+
+/* Heirs are by far the most numerous, and take time.  A process with the same number of
+ * descriptors, and with its own unchanged, most likely still has them, which is checked when it
+ * runs again.  With the same number, there is no new one. */
+static int walk_frozen(struct look *look, struct avc_error *err)
+{
+	const uint32_t count = look->known->count;
+	const int64_t size = size_of_table(look);
+	bool same;
+
+	if (look_at_own(look, &same, err))
+		return -1;
+	look->trusts = same && size == count && !look->files->process->heirs_vary;
+	look->files->trusted = look->trusts;
+	if (look_may_leave_heirs(look))
+		return look_leave_heirs(look, err);
+	if (look_at_heirs(look, &same, err))
+		return -1;
+	close_gaps(look->files, count);
+	return size == look->files->count ? 0 : walk(look, look->files->count, err);
+}
+
+static int by_fd(const void *a, const void *b)
+{
+	return ((const struct file *)a)->fd - ((const struct file *)b)->fd;
+}
+
+static bool are_in_order(const struct files *files)
+{
+	for (uint32_t i = 1; i < files->count; i++)
+		if (files->file[i - 1].fd > files->file[i].fd)
+			return false;
+	return true;
+}
+
+int files_look(struct files *files, const struct files_owner *owner, enum files_depth depth,
+	       struct files *known, struct avc_error *err)
+{
+	const pid_t pid = owner->pid, init = owner->init;
+	struct look look = { .files = files,
+			     .known = known,
+			     .pid = pid,
+			     .init = init,
+			     .pidfd = owner->pidfd,
+			     .later = SOCKETS_LATER,
+			     .reuses = owner->reuses,
+			     .likely = owner->likely,
+			     .likely_count = owner->reuses ? owner->likely_count : 0,
+			     .depth = depth };
+	struct timespec now;
+	int result;
+
+	look.fd_dir = proc_open(pid, "fd", O_RDONLY | O_DIRECTORY);
+	if (look.fd_dir < 0)
+		return fail_errno(err, pid, "look at descriptors", "open(fd)", "it has ended");
+	for (int i = 0; i < 3 && depth != FILES_FROZEN && init; i++) {
+		char name[8];
+		struct statx st;
+
+		snprintf(name, sizeof name, "fd/%d", i);
+		if (!proc_look(init, name, STATX_INO, &st))
+			continue;
+		look.init_stdio[i].dev = makedev(st.stx_dev_major, st.stx_dev_minor);
+		look.init_stdio[i].ino = st.stx_ino;
+	}
+	files->count = 0;
+	clock_gettime(CLOCK_REALTIME, &now);
+	files->taken_ns = (uint64_t)now.tv_sec * NS_PER_S + (uint64_t)now.tv_nsec;
+	if (files->missing && !files->missing->count)
+		result = walk_known(&look, err);
+	else if (depth == FILES_FROZEN && known && known->count <= files->room)
+		result = walk_frozen(&look, err);
+	else if (depth == FILES_BEFORE)
+		result = walk_before(&look, err);
+	else
+		result = walk(&look, 0, err);
+	close(look.fd_dir);
+	files->served = depth == FILES_BEFORE ? mounts_may_be_served(&look.mounts, pid)
+					      : known && known->served;
+	mounts_free(&look.mounts);
+	if (!result && depth == FILES_BEFORE && look.refuses)
+		result = fail(err, AVC_UNSUPPORTED, 0, pid, "look at descriptors", "", "%s",
+			      look.refuses);
+	if (!result && depth != FILES_NOW &&
+	    files_find_device(files, makedev(MISC_MAJOR, FUSE_MINOR)) >= 0)
+		result = fail(err, AVC_UNSUPPORTED, 0, pid, "look at descriptors", "", "%s",
+			      files_serves);
+	if (result) {
+		for (uint32_t i = 0; i < files->count; i++)
+			file_drop_ours(&files->file[i]);
+		return -1;
+	}
+	if (!are_in_order(files))
+		qsort(files->file, files->count, sizeof *files->file, by_fd);
+	if (depth == FILES_FROZEN) {
+		files_check_shared(files, pid);
+		files_find_peers(files, pid); /* of pairs that are quite new */
+		files_find_areas(files, pid);
+	} else {
+		files_find_shared(files, pid);
+		if (depth == FILES_BEFORE)
+			files_find_peers(files, pid);
+	}
+	return 0;
+}
