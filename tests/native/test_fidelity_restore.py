@@ -300,8 +300,8 @@ def test_restores_are_used_up(tmp_path: Path) -> None:
 
 
 @pytest.mark.shared_machine("init waits two seconds for its guard, which is stopped until somebody else has forked")
-@pytest.mark.parametrize("command", ["idle 1 4", "tree 3"])
-def test_who_has_the_pid_is_told(command: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("command", "of_child"), [("idle 1 4", False), ("tree 3", False), ("tree 3", True)])
+def test_who_has_the_pid_is_told(command: str, of_child: bool, tmp_path: Path) -> None:
     """Somebody who takes it before the guard does."""
     # Again, while it is still the group of the others of the tree, which end by themselves.
     take = (
@@ -310,7 +310,8 @@ def test_who_has_the_pid_is_told(command: str, tmp_path: Path) -> None:
     )
     with Victim(command, tmp_path) as victim, GuardProcess(config(60), [victim.pid]) as guard:
         guard.checkpoint()
-        number, dead = inside(victim.app), psutil.Process(victim.app)
+        dead = psutil.Process(children_of(victim.app)[-1] if of_child else victim.app)
+        number = inside(dead.pid)
         thief = subprocess.Popen(
             ["nsenter", "--pid", f"--target={victim.pid}", "sh", "-c", take],
             stdin=subprocess.PIPE,
@@ -332,4 +333,4 @@ def test_who_has_the_pid_is_told(command: str, tmp_path: Path) -> None:
             os.kill(guard.pid, signal.SIGCONT)
             os.killpg(thief.pid, signal.SIGKILL)
             thief.wait()
-        assert re.fullmatch(r"the PID is taken by process \d+ \(sleep, state S\)", error)
+        assert re.fullmatch(rf"PID {number} is taken by process \d+ \(sleep, state S\)", error)

@@ -169,7 +169,7 @@ static int describe_failure(const struct parasite *parasite, const struct inj_sl
 
 /* A number is taken as long as a process has it, or as its group or session (kernel/pid.c,
  * __change_pid()), which a zombie keeps. */
-static int fail_taken(pid_t init, pid_t number, struct avc_error *err)
+int restore_fail_taken(pid_t init, pid_t number, struct avc_error *err)
 {
 	char inside[64] = "", its[64];
 	DIR *proc = proc_link(init, "ns/pid", inside, sizeof inside) < 0 ? NULL : opendir("/proc");
@@ -190,9 +190,10 @@ static int fail_taken(pid_t init, pid_t number, struct avc_error *err)
 		closedir(proc);
 	if (!pid || proc_stat(pid, &stat))
 		return fail(err, AVC_KERNEL, EEXIST, number, "restore", "clone",
-			    "the PID is taken by somebody else");
+			    "PID %d is taken by somebody else", number);
 	return fail(err, AVC_KERNEL, EEXIST, number, "restore", "clone",
-		    "the PID is taken by process %d (%s, state %c)%s", pid, stat.name, stat.state,
+		    "PID %d is taken by process %d (%s, state %c)%s", number, pid, stat.name,
+		    stat.state,
 		    status.inside == number  ? ""
 		    : status.group == number ? " as its group"
 					     : " as its session");
@@ -239,7 +240,7 @@ static int rebuild(struct restore *restore, struct avc_error *err)
 		if (slot->state == INJ_FAILED)
 			return describe_failure(parasite, slot, err);
 	}
-	return fail_taken(restore->channel->init, slot->pid, err);
+	return restore_fail_taken(restore->channel->init, slot->pid, err);
 }
 
 /* ---- one of several ---------------------------------------------------------------- */

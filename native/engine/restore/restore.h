@@ -46,6 +46,9 @@ struct restore {
 struct last_pid *restore_ahead(const struct generation *generation,
 			       const struct init_channel *channel);
 int restore_app(struct restore *restore, struct avc_error *err) warn_unused;
+/* Fails with who has a PID of the container of `init`: as its own, or as that of its group or
+ * session.  Always returns -1. */
+int restore_fail_taken(pid_t init, pid_t number, struct avc_error *err);
 
 /* ---- restore.c, for one process of several ----------------------------------------- */
 

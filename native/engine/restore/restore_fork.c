@@ -266,8 +266,7 @@ static int give_birth(struct birth *birth, pid_t *child, struct avc_error *err)
 			return -1;
 		birth->copy = 0;
 	}
-	return fail(err, AVC_KERNEL, EEXIST, birth->number, "restore", "clone",
-		    "PID %d is taken by somebody else", birth->number);
+	return restore_fail_taken(restored->restore->channel->init, birth->number, err);
 }
 
 /* ---- keepers ---------------------------------------------------------------------------------- */
