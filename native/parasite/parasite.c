@@ -269,11 +269,12 @@ static long make_timer(uint64_t clock, uint64_t event, int32_t *id, int32_t want
 
 /* At the last moment: the remaining time shrinks during the restore.
  *
- * Deadlines stay where they were, with one exception.  A timer that rings once, and soon, may be a
- * watchdog, which the program sets anew all the time.  With its old deadline it would end a program
- * that has gone back further than that before this could set it again, so it has the time that it had
- * at the checkpoint.  Late by what was lost is what any timer may be. */
-static long set_timer(uint64_t nr, uint64_t timer, const struct inj_timer *was, uint64_t asked_ns)
+ * Deadlines stay where they were, with one exception.  A timer that rings once, or whose signal ends
+ * the program, and soon, may be a watchdog, which the program sets anew all the time.  With its old
+ * deadline it would end a program that has gone back further than that before this could set it again,
+ * so it has the time that it had at the checkpoint.  Late by what was lost is what any timer may be. */
+static long set_timer(uint64_t nr, uint64_t timer, const struct inj_timer *was, uint64_t asked_ns,
+		      bool ends)
 {
 	const int64_t unit = nr == __NR_setitimer ? 1000 : 1;
 	const int64_t interval = was->interval[0] * NS_PER_S + was->interval[1] * unit;
@@ -288,7 +289,7 @@ static long set_timer(uint64_t nr, uint64_t timer, const struct inj_timer *was, 
 	left -= now[0] * NS_PER_S + now[1] - (int64_t)asked_ns;
 	if (left <= 0 && interval > 0)
 		left = interval - -left % interval; /* in phase */
-	if (interval == 0 && left < least)
+	if ((interval == 0 || ends) && left < least)
 		left = least;
 	if (left < unit)
 		left = unit; /* at once; 0 would be never */
@@ -347,7 +348,7 @@ static long make_call(const struct inj_syscall *s)
 	if (s->nr == INJ_TIMER_CREATE)
 		return make_timer(arg[0], arg[1], (int32_t *)arg[2], (int32_t)arg[3]);
 	if (s->nr == INJ_TIMER_SET)
-		return set_timer(arg[0], arg[1], (const struct inj_timer *)arg[2], arg[3]);
+		return set_timer(arg[0], arg[1], (const struct inj_timer *)arg[2], arg[3], arg[4]);
 	if (s->nr == INJ_LOCK)
 		return own_lock(arg[0], arg[1], (struct inj_flock *)arg[2]);
 	if (s->nr == INJ_MOVE)

@@ -125,7 +125,7 @@ struct inj_setup {
 #define INJ_LIMIT (-4)
 /* Likewise: timer_settime(2) or setitimer(2) (arg[0], their number) of the timer arg[1], with what
  * is left of the struct inj_timer at arg[2], read at arg[3] ns of the process's CLOCK_MONOTONIC (it
- * may be in a time namespace). */
+ * may be in a time namespace).  arg[4]: its signal ends the process. */
 #define INJ_TIMER_SET (-5)
 /* Likewise: fcntl(arg[0], arg[1], arg[2]), so that the caller is recorded as the owner of the lock.
  * Setting an existing one again changes nothing, not even its recorded owner. */

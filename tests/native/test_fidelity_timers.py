@@ -27,7 +27,7 @@ def test_timers(command: str, where: str, tmp_path: Path) -> None:
         kill_at_random(guard, victim, 60, (0.005, 0.1))
 
 
-@pytest.mark.parametrize("kind", ["alarm", "timer"])
+@pytest.mark.parametrize("kind", ["alarm", "timer", "ticks"])
 def test_a_watchdog_has_its_time_again(kind: str, tmp_path: Path) -> None:
     """The state gone back to is older than the time after which it kills."""
     watched_s = 1.0

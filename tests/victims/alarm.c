@@ -4,8 +4,8 @@
  * handlers, and waits for them: none may come early or late by more than a checkpoint
  * or a restore takes.
  *
- * alarm MS alarm|timer: one of the two is its watchdog.  It sets it again every 5 ms, and no
- * handler keeps the signal from killing it.
+ * alarm MS alarm|timer|ticks: one of the two is its watchdog.  It sets it again every 5 ms, and no
+ * handler keeps the signal from killing it.  `ticks`: an alarm that would ring again every 1 ms.
  */
 #include <signal.h>
 #include <sys/time.h>
@@ -23,9 +23,10 @@ static void on_alarm(int sig)
 	rung = 1;
 }
 
-static void set_alarm(uint64_t ms)
+static void set_alarm(uint64_t ms, long again_us)
 {
-	const struct itimerval in = { { 0, 0 }, { (time_t)(ms / 1000), (long)(ms % 1000 * 1000) } };
+	const struct itimerval in = { { 0, again_us },
+				      { (time_t)(ms / 1000), (long)(ms % 1000 * 1000) } };
 
 	must(!setitimer(ITIMER_REAL, &in, NULL), "setitimer");
 }
@@ -41,10 +42,10 @@ static void set_timer(timer_t timer, uint64_t ms)
 static void watch(const char *what, timer_t timer, uint64_t ms)
 {
 	for (;;) {
-		if (!strcmp(what, "alarm"))
-			set_alarm(ms);
-		else
+		if (!strcmp(what, "timer"))
 			set_timer(timer, ms);
+		else
+			set_alarm(ms, strcmp(what, "ticks") ? 0 : 1000);
 		beat();
 		usleep(5000);
 	}
@@ -56,7 +57,7 @@ int main(int argc, char **argv)
 	uint64_t ms, lap;
 	timer_t timer;
 
-	victim_start(&argc, argv, 1, "MS [alarm|timer]");
+	victim_start(&argc, argv, 1, "MS [alarm|timer|ticks]");
 	ms = (uint64_t)atol(argv[1]);
 	must(!timer_create(CLOCK_MONOTONIC, NULL, &timer), "timer_create");
 	if (argc > 2) {
@@ -71,7 +72,7 @@ int main(int argc, char **argv)
 		rung = 0;
 		due_ns = now_ns() + ms * 1000000;
 		if (lap % 2)
-			set_alarm(ms);
+			set_alarm(ms, 0);
 		else
 			set_timer(timer, ms);
 		while (!rung) {

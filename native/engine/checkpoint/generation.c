@@ -246,7 +246,7 @@ static int fill_slot(struct image *image, struct avc_error *err)
 	pending_setup(process, &setup);
 	if (attributes_keep(image, err))
 		return -1;
-	timers_setup(process, &setup);
+	timers_setup(process, &status, &setup);
 	if (process->descendant)
 		process_attrs_setup_limits(image, &setup);
 	/* A change of users clears it for the whole process, whichever thread makes it. */

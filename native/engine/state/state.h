@@ -106,8 +106,8 @@ void timers_parse(struct timers *timers, char *text);
 /* While everything is stopped: adds the first calls to the list; takes their results. */
 void timers_ask(struct process *process, struct inj_call *call);
 void timers_answer(struct process *process, const struct inj_call *call, uint64_t took_ns);
-/* When the app runs again. */
-void timers_setup(struct process *process, struct setup *setup);
+/* When the app runs again; `status` is its own. */
+void timers_setup(struct process *process, const struct proc_status *status, struct setup *setup);
 
 /* ---- attributes.c ----------------------------------------------------------------- */
 

@@ -150,16 +150,39 @@ static bool ticks(const struct inj_timer *s)
 	return s->interval[0] || s->interval[1];
 }
 
+/* Whether the process dies of such a signal. */
+static bool ends_it(const struct proc_status *status, int signal)
+{
+	const uint64_t harmless = SIGNAL_BIT(SIGCHLD) | SIGNAL_BIT(SIGCONT) | SIGNAL_BIT(SIGURG) |
+				  SIGNAL_BIT(SIGWINCH) | SIGNAL_BIT(SIGSTOP) | SIGNAL_BIT(SIGTSTP) |
+				  SIGNAL_BIT(SIGTTIN) | SIGNAL_BIT(SIGTTOU);
+
+	return signal > 0 && signal < NSIG &&
+	       !((harmless | status->caught | status->ignored | status->blocked) &
+		 SIGNAL_BIT(signal));
+}
+
+enum counts {
+	COUNTS_CPU,   /* time of its own                                        */
+	COUNTS_CLOCK, /* until a deadline                                       */
+	COUNTS_DOWN   /* until the process ends of it                           */
+};
+
+static enum counts counts(bool cpu, const struct proc_status *status, int signal)
+{
+	return cpu ? COUNTS_CPU : ends_it(status, signal) ? COUNTS_DOWN : COUNTS_CLOCK;
+}
+
 static void add_setting(struct setup *setup, const struct timers *timers, long nr, uint64_t timer,
-			const struct inj_timer *s, bool cpu)
+			const struct inj_timer *s, enum counts counts)
 {
 	const char *name = nr == SYS_setitimer ? "setitimer" : "timer_settime";
 	const avc_remote at = setup_data(setup, s, sizeof *s);
 	struct inj_setup *set;
 
-	if (!cpu)
+	if (counts != COUNTS_CPU)
 		set = setup_add(setup, INJ_AFTER, name, INJ_TIMER_SET, (uint64_t)nr, timer, at,
-				timers->asked_ns);
+				timers->asked_ns, counts == COUNTS_DOWN);
 	else if (nr == SYS_setitimer)
 		set = setup_add(setup, INJ_AFTER, name, nr, timer, at);
 	else
@@ -168,7 +191,8 @@ static void add_setting(struct setup *setup, const struct timers *timers, long n
 }
 
 static void add_posix(struct process *process, const struct posix_timer *t,
-		      const struct inj_timer *s, bool valid, struct setup *setup)
+		      const struct inj_timer *s, bool valid, const struct proc_status *status,
+		      struct setup *setup)
 {
 	const int32_t id = t->id;
 	struct sigevent event = {
@@ -190,7 +214,8 @@ static void add_posix(struct process *process, const struct posix_timer *t,
 		->flags = INJ_MAY_FAIL;
 	if (valid && runs(s) && !has_just_expired(process, s, 1, t->signal, t->id))
 		add_setting(setup, process->timers, SYS_timer_settime, (uint64_t)id, s,
-			    counts_cpu(t->clock));
+			    counts(counts_cpu(t->clock), status,
+				   t->notify & SIGEV_NONE ? 0 : t->signal));
 }
 
 static int by_id(const void *a, const void *b)
@@ -200,7 +225,7 @@ static int by_id(const void *a, const void *b)
 	return ((*x)->id > (*y)->id) - ((*x)->id < (*y)->id);
 }
 
-void timers_setup(struct process *process, struct setup *setup)
+void timers_setup(struct process *process, const struct proc_status *status, struct setup *setup)
 {
 	const struct timers *timers = process->timers;
 	const struct posix_timer *sorted[POSIX_MAX];
@@ -213,7 +238,7 @@ void timers_setup(struct process *process, struct setup *setup)
 		const size_t k = (size_t)(sorted[i] - timers->posix);
 
 		add_posix(process, sorted[i], &timers->setting[ITIMERS + k],
-			  timers->valid[ITIMERS + k], setup);
+			  timers->valid[ITIMERS + k], status, setup);
 	}
 	for (int which = 0; which < ITIMERS; which++) {
 		const struct inj_timer *s = &timers->setting[which];
@@ -221,7 +246,8 @@ void timers_setup(struct process *process, struct setup *setup)
 
 		if (timers->valid[which] && (runs(s) || (real && ticks(s))) &&
 		    !(real && has_just_expired(process, s, 1000, SIGALRM, -1)))
-			add_setting(setup, timers, SYS_setitimer, (uint64_t)which, s, !real);
+			add_setting(setup, timers, SYS_setitimer, (uint64_t)which, s,
+				    counts(!real, status, SIGALRM));
 	}
 	if (timers->too_many && !setup->notice.code)
 		fail(&setup->notice, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
