@@ -147,10 +147,12 @@ def groups_of(pid: int) -> Groups:
     memory = unified = None
     freezers: list[Path] = []
     version = 2
+    # Read once: a busy host has hundreds of mounts, and version 1 a dozen groups for each process.
+    mounts = [(prefix, mount) for owner, prefix in (("1", "/proc/1/root"), ("self", "")) for mount in _mounts(owner)]
     for line in _lines(Path(f"/proc/{pid}/cgroup")):
         _, names, path = line.split(":", 2)
         controllers = frozenset(names.split(",")) - {""}
-        directory = _directory(controllers, path)
+        directory = _directory(mounts, controllers, path)
         if directory is None:
             continue
         directories.append(directory)
@@ -174,17 +176,16 @@ def is_paused(pid: int) -> bool:
         return False
 
 
-def _directory(controllers: frozenset[str], path: str) -> Path | None:
-    for owner, prefix in (("1", "/proc/1/root"), ("self", "")):
-        for mount in _mounts(owner):
-            if mount.controllers != controllers or (mount.version == 2) != (not controllers):
-                continue
-            inner = os.path.relpath(path, mount.root)
-            if inner.startswith(".."):
-                continue
-            directory = Path(f"{prefix}{mount.where}") / inner
-            if os.path.isdir(directory):  # pathlib raises without permission
-                return directory
+def _directory(mounts: list[tuple[str, Mount]], controllers: frozenset[str], path: str) -> Path | None:
+    for prefix, mount in mounts:
+        if mount.controllers != controllers or (mount.version == 2) != (not controllers):
+            continue
+        inner = os.path.relpath(path, mount.root)
+        if inner.startswith(".."):
+            continue
+        directory = Path(f"{prefix}{mount.where}") / inner
+        if os.path.isdir(directory):  # pathlib raises without permission
+            return directory
     return None
 
 
