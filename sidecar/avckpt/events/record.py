@@ -104,14 +104,14 @@ class EventRecord:
     def to_json(self) -> dict[str, object]:
         """The fields that apply, and `message`."""
         data: dict[str, object] = {}
-        for each in fields(self):
-            value = getattr(self, each.name)
+        for name in _NAMES:
+            value = getattr(self, name)
             if isinstance(value, enum.Enum):
                 value = value.value
             elif isinstance(value, (AvckptError, Crash)):
                 value = value.to_json()
             if value is not None:
-                data[each.name] = value
+                data[name] = value
         data["message"] = self.message
         return data
 
@@ -129,6 +129,9 @@ class EventRecord:
         if "kind" not in values:
             raise ValueError("it has no kind")
         return cls(**cast("dict[str, Any]", values))
+
+
+_NAMES = tuple(each.name for each in fields(EventRecord))
 
 
 def _value(name: str, kind: type, value: object) -> object:
