@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from avckpt.cli.client import Client
+from avckpt.cli.client import CPU_SHARES, Client
 from avckpt.cli.sidecar_container import answers
 from avckpt.errors import AvckptError
 from avckpt.guard import Command
@@ -399,7 +399,8 @@ class Sidecar:
         config = ("--volume", f"{CONFIG_DIR}:/etc/avckpt:ro") if CONFIG_DIR.is_dir() else ()
         self.podman.run(
             *("run", "--detach", "--pull=never", "--name", SIDECAR_NAME, "--label", f"{OURS}=1"),
-            *("--privileged", "--pid=host", "--network=none", "--volume", f"{RUN_DIR}:/run/avckpt"),
+            *("--privileged", "--pid=host", "--network=none", f"--cpu-shares={CPU_SHARES}"),
+            *("--volume", f"{RUN_DIR}:/run/avckpt"),
             *(*config, SIDECAR_IMAGE),
         )
         try:

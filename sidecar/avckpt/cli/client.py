@@ -40,12 +40,17 @@ def start_it(run_dir: Path) -> str:
     return f"start it with: {sudo}{run_it(run_dir)}"
 
 
+CPU_SHARES = 4096
+"""Of the sidecar's container, with all guards: four times those of another, for it is needed when there is no CPU
+left."""
+
+
 def run_it(run_dir: Path) -> str:
     """The command that starts its container.  With --replace one of that name that is stopped, or hangs, is no
     obstacle."""
     return (
         "podman run -d --replace --restart=always --name avckpt-sidecar --privileged --pid=host --network=none "
-        f"-v {run_dir}:/run/avckpt -v /etc/avckpt:/etc/avckpt:ro localhost/avckpt-sidecar"
+        f"--cpu-shares={CPU_SHARES} -v {run_dir}:/run/avckpt -v /etc/avckpt:/etc/avckpt:ro localhost/avckpt-sidecar"
     )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from avckpt_hooks.shared.protocol import STATE_DIR
 
-from avckpt.cli.client import Client
+from avckpt.cli.client import CPU_SHARES, Client
 from avckpt.cli.podman import PodmanFailed, podman
 from avckpt.errors import SidecarUnreachable
 from avckpt.events.system_journal import SOCKET
@@ -80,7 +80,7 @@ def options(run_dir: Path) -> list[str]:
     journal = ["--volume", f"{JOURNAL}:{JOURNAL}"] if JOURNAL.is_dir() else []
     history = ["--volume", f"{STATE_DIR}:{STATE_DIR}"] if Path(STATE_DIR).is_dir() else []
     volumes = ["--volume", f"{run_dir}:/run/avckpt", *config, *journal, *history]
-    return ["--restart=always", "--privileged", "--pid=host", "--network=none", *volumes]
+    return ["--restart=always", "--privileged", "--pid=host", "--network=none", f"--cpu-shares={CPU_SHARES}", *volumes]
 
 
 def answers(client: Client) -> bool:
