@@ -247,14 +247,17 @@ static void note_stat(struct file *f, const struct statx *st)
 	f->changed = (struct timespec){ st->stx_ctime.tv_sec, st->stx_ctime.tv_nsec };
 }
 
-/* TCP or UDP: reading it takes no look at a file system, for which the app may not be stopped. */
-static bool is_internet(const struct look *look, int number)
+/* TCP or UDP: reading it takes no look at a file system, for which the app may not be stopped.  Or it
+ * has been closed since its name was read: the app may open the next one under its number before we
+ * have a duplicate, and close that. */
+static bool is_internet_or_closed(const struct look *look, int number)
 {
 	char path[48], protocol[32] = "";
 
 	snprintf(path, sizeof path, "/proc/%d/fd/%d", look->pid, number);
-	return getxattr(path, "system.sockprotoname", protocol, sizeof protocol - 1) > 0 &&
-	       (!strncmp(protocol, "TCP", 3) || !strncmp(protocol, "UDP", 3));
+	if (getxattr(path, "system.sockprotoname", protocol, sizeof protocol - 1) < 0)
+		return errno == ENOENT || errno == EOPNOTSUPP || errno == ENODATA;
+	return !strncmp(protocol, "TCP", 3) || !strncmp(protocol, "UDP", 3);
 }
 
 static bool takes_duplicate(struct look *look, struct file *f)
@@ -265,7 +268,7 @@ static bool takes_duplicate(struct look *look, struct file *f)
 
 	if (f->kind != FILE_SOCKET)
 		return file_is_video(f);
-	if (!s && look->later && is_internet(look, f->fd)) {
+	if (!s && look->later && is_internet_or_closed(look, f->fd)) {
 		look->later--;
 		return false;
 	}
