@@ -320,7 +320,7 @@ class Run:
                         self._bring_out()
         if self._oracle.wrong:
             return "wrong"
-        if time.monotonic() - self._oracle.last_s > SILENT_S:
+        if time.monotonic() - self._oracle.last_s > min(SILENT_S, self._seconds / 2):
             if row["restores"]:
                 print(f"{self._cell.language}, {self._cell.fault}: stuck: {tasks(row['app_pid'])}", file=sys.stderr)
             return "stuck"
