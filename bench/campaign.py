@@ -48,6 +48,7 @@ from avckpt.errors import AvckptError
 
 from testkit.harness import BASE_IMAGE, ROOT, CommandFailed, Podman, wait_until
 from testkit.local_sidecar import LocalSidecar, hooked_podman, local_sidecar
+from testkit.procfs import state_of
 
 RESULTS = ROOT / "bench" / "results" / "campaign.json"
 FAULTS = ROOT / "bench" / "faults"
@@ -265,18 +266,18 @@ def world(programs: Path, labels: dict[str, str], options: list[str], *, ros: bo
 
 
 class Run:
-    """One of them."""
+    """One of them, which begins now."""
 
     def __init__(self, world: World, cell: Cell, name: str, seconds: float) -> None:
         self._world = world
         self._cell = cell
         self._seconds = seconds
+        self._begun = time.time()
         self.name = name
+        self._oracle = Oracle()
 
     def outcome(self) -> str:
         """Makes it.  Raises TimeoutError, OSError or CommandFailed when the program could not be protected."""
-        self._begun = time.time()
-        self._oracle = Oracle()
         cell, port, relay = self._cell, self._oracle.port, None
         try:
             if cell.language == "ROS":
@@ -337,14 +338,18 @@ class Run:
         return self._world.rows.of(self.name)
 
 
+def outcome(world: World, cell: Cell, name: str, seconds: float) -> str:
+    """Of a run that begins when it is its turn."""
+    return Run(world, cell, name, seconds).outcome()
+
+
 def tasks(pid: int) -> str:
     """What each thread of a process waits for: one that was restored and is stuck is a defect of ours."""
     found = []
     for task in sorted(Path(f"/proc/{pid}/task").glob("*")):
         with contextlib.suppress(OSError):
-            state = (task / "stat").read_text().rpartition(")")[2].split()[0]
             texts = [(task / name).read_text().strip() for name in ("comm", "wchan", "syscall")]
-            found.append(f"{task.name} {state} {' '.join(texts)}")
+            found.append(f"{task.name} {state_of(int(task.name))} {' '.join(texts)}")
     return "; ".join(found)
 
 
@@ -402,8 +407,8 @@ def make(cells: list[Cell], number: int, options: argparse.Namespace, programs: 
     with world(programs, labels, options.podman, ros=ros) as here, pool:
         made: dict[concurrent.futures.Future[str], Cell] = {}
         for i, (_, _, cell) in enumerate(missing):
-            run = Run(here, cell, f"avckpt-campaign-{os.getpid()}-{number}-{i}", options.seconds)
-            made[pool.submit(run.outcome)] = cell
+            name = f"avckpt-campaign-{os.getpid()}-{number}-{i}"
+            made[pool.submit(outcome, here, cell, name, options.seconds)] = cell
         for i, done in enumerate(concurrent.futures.as_completed(made), 1):
             cell = made[done]
             try:

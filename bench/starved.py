@@ -21,13 +21,12 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from bench.cpu_group import CONTROLLERS, first_in_line
 from testkit.harness import wait_until
 from testkit.local_sidecar import local_sidecar
 
-CPU = Path("/sys/fs/cgroup/cpu")
+CPU = CONTROLLERS / "cpu"
 SHARES = 1024
-OURS = 262144
-"""This program only watches."""
 LABELS = {"avckpt.enable": "true", "avckpt.interval": "200ms", "avckpt.restore.max": "64/10s"}
 PROGRAM = "import time\nwhile True: time.sleep(0.01); sum(range(2000))"
 KILLS = 15
@@ -82,7 +81,7 @@ def main() -> None:
     options = parser.parse_args()
     print("| shares | restore, ms | longest | freeze, ms | longest |\n|---:|---:|---:|---:|---:|")
     with contextlib.ExitStack() as stack:
-        stack.enter_context(group("bench", OURS, os.getpid()))
+        stack.enter_context(first_in_line())  # this program only watches
         for number in range(options.busy):
             busy = stack.enter_context(subprocess.Popen(["sh", "-c", "while :; do :; done"], start_new_session=True))
             stack.enter_context(group(f"busy{number}", SHARES, busy.pid))

@@ -176,8 +176,9 @@ void proc_await_end(pid_t tid);
 int proc_children(pid_t pid, pid_t *children, int max);
 /* The same for one thread, from the open /proc/PID/task of its process. */
 int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max);
-/* Calls fn for every task of an open /proc/PID/task; stops when it returns < 0. */
-int proc_tasks(int task_dirfd, int (*fn)(pid_t tid, void *arg), void *arg);
+/* Calls fn for every number in an open directory of /proc (PID/task, PID/fd) from its start; stops when
+ * it returns < 0, with -1. */
+int proc_numbers(int dirfd, int (*fn)(pid_t number, void *arg), void *arg);
 /* Whether two tasks have the same memory (kcmp(2)). */
 bool proc_same_memory(pid_t a, pid_t b);
 /* Likewise the same descriptor table, or the same working directory and umask: 1 or 0; -1: unknown.

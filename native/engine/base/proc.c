@@ -221,7 +221,7 @@ pid_t proc_live_thread(pid_t pid)
 	dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
 	if (dirfd < 0)
 		return 0;
-	(void)proc_tasks(dirfd, find_live, &found);
+	(void)proc_numbers(dirfd, find_live, &found);
 	close(dirfd);
 	return found;
 }
@@ -339,14 +339,14 @@ struct linux_dirent64 {
 	char d_name[];
 };
 
-int proc_tasks(int task_dirfd, int (*fn)(pid_t tid, void *arg), void *arg)
+int proc_numbers(int dirfd, int (*fn)(pid_t number, void *arg), void *arg)
 {
 	char buf[16384] __attribute__((aligned(8)));
 
-	if (lseek(task_dirfd, 0, SEEK_SET) < 0)
+	if (lseek(dirfd, 0, SEEK_SET) < 0)
 		return -1;
 	for (;;) {
-		long n = syscall(SYS_getdents64, task_dirfd, buf, sizeof buf);
+		long n = syscall(SYS_getdents64, dirfd, buf, sizeof buf);
 
 		if (n < 0)
 			return -1;

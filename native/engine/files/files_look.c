@@ -8,9 +8,9 @@
  */
 #include <fcntl.h>
 #include <linux/major.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <sys/stat.h>
-#include <sys/syscall.h>
 #include <sys/sysmacros.h>
 #include <time.h>
 #include <unistd.h>
@@ -21,14 +21,6 @@
 /* So many new sockets of a process are read in the freeze, where each makes it longer by 2 us, or by
  * some 20 if it could be recreated. */
 #define SOCKETS_LATER 128
-
-struct linux_dirent64 {
-	uint64_t d_ino;
-	int64_t d_off;
-	unsigned short d_reclen;
-	unsigned char d_type;
-	char d_name[];
-};
 
 static int by_object(const void *a, const void *b)
 {
@@ -46,15 +38,17 @@ void files_missing_sort(struct files_missing *missing)
 }
 
 /* A program may have opened thousands since, which only have to be closed. */
-static bool is_of_interest(const struct look *look, const char *name)
+static bool is_of_interest(const struct look *look, int number)
 {
 	const struct files_missing *missing = look->files->missing;
 	struct file key = { 0 };
 	const struct file *wanted = &key;
 	struct statx st;
+	char name[16];
 
-	if (!missing || files_find(look->known, atoi(name)))
+	if (!missing || files_find(look->known, number))
 		return true;
+	snprintf(name, sizeof name, "%d", number);
 	if (!missing->count || statx(look->fd_dir, name, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT,
 				     STATX_TYPE | STATX_INO, &st))
 		return false;
@@ -72,28 +66,32 @@ static int walk_known(struct look *look, struct avc_error *err)
 	return 0;
 }
 
+struct walk {
+	struct look *look;
+	uint32_t seen; /* the first so many of the table are there already */
+	bool failed;
+	struct avc_error *err;
+};
+
+static int look_at_number(pid_t number, void *arg)
+{
+	struct walk *walk = arg;
+
+	walk->failed = is_of_interest(walk->look, number) &&
+		       !files_find_among(walk->look->files, walk->seen, number) &&
+		       look_at_descriptor(walk->look, number, walk->err);
+	return walk->failed ? -1 : 0;
+}
+
 static int walk(struct look *look, uint32_t seen, struct avc_error *err)
 {
-	char buf[16384] __attribute__((aligned(8)));
+	struct walk walk = { .look = look, .seen = seen, .err = err };
 
-	for (;;) {
-		const long n = syscall(SYS_getdents64, look->fd_dir, buf, sizeof buf);
-
-		if (n < 0)
-			return fail_errno(err, look->pid, "look at descriptors", "getdents64",
-					  "it has ended");
-		if (n == 0)
-			return 0;
-		for (long at = 0; at < n;) {
-			const struct linux_dirent64 *entry = (struct linux_dirent64 *)(buf + at);
-
-			at += entry->d_reclen;
-			if (entry->d_name[0] != '.' && is_of_interest(look, entry->d_name) &&
-			    !files_find_among(look->files, seen, atoi(entry->d_name)) &&
-			    look_at_descriptor(look, atoi(entry->d_name), err))
-				return -1;
-		}
-	}
+	if (proc_numbers(look->fd_dir, look_at_number, &walk) == 0)
+		return 0;
+	return walk.failed ? -1
+			   : fail_errno(err, look->pid, "look at descriptors", "getdents64",
+					"it has ended");
 }
 
 /* How many it has, since Linux 6.2. */

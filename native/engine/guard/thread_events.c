@@ -142,7 +142,7 @@ static int follow(struct thread_events *events, const struct thread_event_kind *
 
 	while (look.found) {
 		look.found = false;
-		if (proc_tasks(process->task_dirfd, follow_thread, &look) < 0)
+		if (proc_numbers(process->task_dirfd, follow_thread, &look) < 0)
 			return proc_is_exiting(process->pid) ? 0 : -1;
 	}
 	return 0;

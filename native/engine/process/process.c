@@ -339,7 +339,7 @@ int process_list_threads(struct process *process, struct avc_error *err)
 		process->threads[0].seen = true;
 		return 0;
 	}
-	if (proc_tasks(process->task_dirfd, count_task, &walk))
+	if (proc_numbers(process->task_dirfd, count_task, &walk))
 		return fail_errno(err, process->pid, "walk threads", "getdents64", "it has ended");
 	if (walk.count > THREADS_MAX)
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "walk threads", "",

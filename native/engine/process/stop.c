@@ -113,7 +113,7 @@ static int stop_rest(struct process *process, struct avc_error *err)
 			return -1;
 		if (everybody_stopped(process))
 			return 0;
-		if (proc_tasks(process->task_dirfd, stop_task, &walk))
+		if (proc_numbers(process->task_dirfd, stop_task, &walk))
 			return err->code ? -1
 					 : fail_errno(err, process->pid, "freeze", "getdents64",
 						      "it has ended");

@@ -236,7 +236,7 @@ bool process_is_quiescent(const struct process *process)
 	if (proc_stat_of(process->stat_fd, &stat) == 0 && stat.threads == 1) {
 		if (stat.state == 'R')
 			return false;
-	} else if (proc_tasks(process->task_dirfd, is_awake, &pid)) {
+	} else if (proc_numbers(process->task_dirfd, is_awake, &pid)) {
 		return false;
 	}
 	return !(process->tcp_messages && is_in_message(process));

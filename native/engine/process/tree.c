@@ -162,7 +162,7 @@ static int look_below(struct tree *tree, int task_dirfd, int parent, struct avc_
 {
 	struct looking look = { tree, task_dirfd, parent, err };
 
-	return proc_tasks(task_dirfd, look_at_task, &look) && err->code ? -1 : 0;
+	return proc_numbers(task_dirfd, look_at_task, &look) && err->code ? -1 : 0;
 }
 
 /* It has one thread. */

@@ -461,6 +461,6 @@ void attributes_put_back(const struct attributes *attributes, pid_t pid, struct 
 	dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
 	if (dirfd < 0)
 		return; /* it has already been killed again */
-	(void)proc_tasks(dirfd, put_back, &search);
+	(void)proc_numbers(dirfd, put_back, &search);
 	close(dirfd);
 }

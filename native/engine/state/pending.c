@@ -98,7 +98,7 @@ static void assign(struct process *process, const struct proc_status *status)
 	}
 }
 
-static bool ends_by_default(int signal)
+bool signal_ends_by_default(int signal)
 {
 	return signal != SIGCHLD && signal != SIGURG && signal != SIGWINCH && signal != SIGCONT &&
 	       signal != SIGSTOP && signal != SIGTSTP && signal != SIGTTIN && signal != SIGTTOU;
@@ -114,7 +114,7 @@ static int find_deadly(const struct process *process, const struct proc_status *
 	for (uint32_t k = 0; k < pending->count; k++) {
 		const int signal = pending->signal[k].info.si_signo;
 
-		if (!ends_by_default(signal) || spared >> (signal - 1) & 1)
+		if (!signal_ends_by_default(signal) || spared >> (signal - 1) & 1)
 			continue;
 		for (uint32_t i = 0; i < process->thread_count; i++) {
 			const struct thread *t = &process->threads[i];

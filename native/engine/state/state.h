@@ -93,6 +93,8 @@ int pending_read(struct process *process, struct avc_error *err) warn_unused;
 int pending_check(const struct process *process, struct avc_error *err) warn_unused;
 /* Whether there is such a signal; of a POSIX timer, if timer >= 0. */
 bool pending_contains(const struct pending *pending, int signal, int timer);
+/* Whether a process without a handler dies of it (signal(7)). */
+bool signal_ends_by_default(int signal);
 /* When the app runs again: one thread's, after setup_thread(); the process's. */
 void pending_setup_thread(const struct process *process, const struct thread *thread,
 			  struct setup *setup);

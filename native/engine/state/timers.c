@@ -153,13 +153,10 @@ static bool ticks(const struct inj_timer *s)
 /* Whether the process dies of such a signal. */
 static bool ends_it(const struct proc_status *status, int signal)
 {
-	const uint64_t harmless = SIGNAL_BIT(SIGCHLD) | SIGNAL_BIT(SIGCONT) | SIGNAL_BIT(SIGURG) |
-				  SIGNAL_BIT(SIGWINCH) | SIGNAL_BIT(SIGSTOP) | SIGNAL_BIT(SIGTSTP) |
-				  SIGNAL_BIT(SIGTTIN) | SIGNAL_BIT(SIGTTOU);
+	const uint64_t spared = status->caught | status->ignored | status->blocked;
 
-	return signal > 0 && signal < NSIG &&
-	       !((harmless | status->caught | status->ignored | status->blocked) &
-		 SIGNAL_BIT(signal));
+	return signal > 0 && signal < NSIG && signal_ends_by_default(signal) &&
+	       !(spared & SIGNAL_BIT(signal));
 }
 
 enum counts {
