@@ -85,11 +85,13 @@ EVERYWHERE = (
 NOT_ROS = ("death of a thread",)
 NOT_GO = (
     *("double free", "assertion", "truncated mapped file", "memory leak to a limit", "death of a child"),
+    *("burst of bad messages", "bad job in a queue"),
     *("deadlock, own watchdog", "livelock, own watchdog", "lost wake-up, own watchdog", "timer without a handler"),
 )
 ONLY_CPP = (
     *("wild pointer", "write to constant", "call through null", "use after free", "heap corruption found later"),
     *("stack smashed", "division by zero", "illegal instruction", "race", "hang in a callback", "broken pipe"),
+    "threads that meet",
     *("hang in a callback, own watchdog", "the only thread ends", "pure virtual call", "huge allocation"),
 )
 WATCHED_THREAD = "death of a thread, own watchdog"

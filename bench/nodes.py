@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes below a launcher: kills random ones of many in one container, again and again.
 
-    python -m bench.nodes [--launcher shell|supervisord|roslaunch] [--nodes 20] [--kills 1000] [--idle SECONDS]
+    python -m bench.nodes [--launcher shell|supervisord|roslaunch|ros2] [--nodes 20] [--kills 1000] [--idle SECONDS]
 
 Every node (tests/victims/crash.c) beats a thousand times a second.  It is killed by a signal from
 outside, or faults, aborts or exits by itself.  What counts is the gap between two beats of the one
@@ -11,7 +11,8 @@ runnable and got no CPU in the whole window (schedstat).  With --idle nothing is
 sleep: what protecting them costs is measured for that time.
 
 Needs root, Podman and what `make setup` builds; roslaunch needs scripts/setup-ros.sh, supervisord
-PyPI's supervisor.  Sidecar and hooks are its own, beside those of the machine.  Prints a table and
+PyPI's supervisor; ros2, which neither Debian nor PyPI has, a virtual environment with `ros2 launch`
+in it (--ros2 FOLDER).  Sidecar and hooks are its own, beside those of the machine.  Prints a table and
 writes bench/results/nodes.json.
 """
 
@@ -75,6 +76,16 @@ environment=NODE="{n}"
 PACKAGE = "<package><name>nodes</name><version>1.0.0</version><description>n</description></package>\n"
 LAUNCH_NODE = """ <node pkg="nodes" type="node" name="n{n}" output="screen"
   launch-prefix="$(env AVCKPT_INIT) --name n{n} --"><env name="NODE" value="{n}"/></node>
+"""
+LAUNCH_PY = """
+import os
+from launch import LaunchDescription
+from launch.actions import ExecuteProcess
+def node(n):
+    prefix = os.environ["AVCKPT_INIT"] + f" --name n{{n}} --"
+    return ExecuteProcess(cmd=["/bench/nodes/node"], prefix=prefix, additional_env={{"NODE": str(n)}}, output="screen")
+def generate_launch_description():
+    return LaunchDescription([node(n + 1) for n in range({nodes})])
 """
 
 console = Console(highlight=False)
@@ -181,6 +192,10 @@ def start(sidecar: LocalSidecar, folder: Path, stack: ExitStack, options: argpar
     elif options.launcher == "roslaunch":
         command, image = ["roslaunch", "nodes", "all.launch"], ros_image(factory.podman)
         others = ["-e", "ROS_PACKAGE_PATH=/bench:/usr/share", "-e", "ROS_MASTER_URI=http://localhost:11311"]
+    elif options.launcher == "ros2":
+        (folder / "all.launch.py").write_text(LAUNCH_PY.format(nodes=options.nodes))
+        command = [f"{options.ros2}/bin/ros2", "launch", "/bench/all.launch.py"]
+        others = ["-v", f"{options.ros2}:{options.ros2}:ro", "-e", f"AMENT_PREFIX_PATH={options.ros2}"]
     labels = {"scope": "nodes", "restore.max": "64/1s", "restore.on": "signal,exit", "files": "rewind"}
     if options.interval:
         labels["interval"] = options.interval
@@ -297,7 +312,8 @@ def idle(nodes: Nodes, options: argparse.Namespace) -> Idle:
 def main() -> None:
     """Starts, kills or waits, removes; results of other launchers stay in the file."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--launcher", choices=("shell", "supervisord", "roslaunch"), default="shell")
+    parser.add_argument("--launcher", choices=("shell", "supervisord", "roslaunch", "ros2"), default="shell")
+    parser.add_argument("--ros2", type=Path, help="where `ros2 launch` is installed")
     parser.add_argument("--nodes", type=int, default=20)
     parser.add_argument("--kills", type=int, default=1000)
     parser.add_argument("--interval", default="", help="avckpt.interval of all nodes (that of the release)")

@@ -8,6 +8,7 @@
 // With -DROS it is a node of ROS 1, which computes in the callback of a timer and publishes on
 // /terms_PORT; `faults relay PORT` is the node that hears it, and sends to PORT.
 #include <arpa/inet.h>
+#include <atomic>
 #include <cassert>
 #include <condition_variable>
 #include <csignal>
@@ -61,6 +62,7 @@ static volatile int *volatile null_pointer;
 static volatile int zero, sink;
 static Shape *volatile shape = new Shape;
 static int (*volatile function)() = nullptr;
+static int queue = -1;
 
 // As the compiler must not see that it ends nowhere.
 __attribute__((noinline)) static int recurse(int n)
@@ -83,6 +85,64 @@ static std::mutex one, other;
 static std::condition_variable woken;
 static bool work_is_there;
 static std::map<int, int> shared_map;
+
+// What it is sent, and does a part of with each term: by others, and by itself.
+static int inputs[2] = { -1, -1 };
+static sockaddr_in input_at;
+
+static void open_inputs()
+{
+	int ends[2];
+	socklen_t bytes = sizeof input_at;
+
+	input_at.sin_family = AF_INET;
+	input_at.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+	inputs[0] = socket(AF_INET, SOCK_DGRAM | SOCK_NONBLOCK, 0);
+	if (bind(inputs[0], (sockaddr *)&input_at, sizeof input_at) ||
+	    getsockname(inputs[0], (sockaddr *)&input_at, &bytes) || pipe2(ends, O_NONBLOCK))
+		abort();
+	inputs[1] = ends[0];
+	queue = ends[1];
+}
+
+static void take_input()
+{
+	char job = 0;
+
+	for (const int input : inputs)
+		if (read(input, &job, 1) == 1 && job == 'x')
+			sink = *null_pointer;
+}
+
+static void send_bad_messages()
+{
+	for (int i = 0; i < 50; i++)
+		sendto(inputs[0], "x", 1, 0, (sockaddr *)&input_at, sizeof input_at);
+}
+
+// A second and a half before the bad one is its turn.
+static void queue_a_bad_job()
+{
+	const std::string jobs = std::string(150, '.') + "x";
+
+	if (write(queue, jobs.data(), jobs.size()) < 0)
+		abort();
+}
+
+// What one of them does for 2 ms the other must not do meanwhile.
+static void meet_later()
+{
+	static std::atomic<int> inside;
+
+	for (int t = 0; t < 2; t++)
+		std::thread([] {
+			nap(1500);
+			if (inside++)
+				sink = *null_pointer;
+			nap(2);
+			inside--;
+		}).detach();
+}
 
 static void hang()
 {
@@ -251,6 +311,12 @@ static void break_down()
 		leak_descriptors();
 	else if (fault == "race")
 		race();
+	else if (fault == "burst of bad messages")
+		send_bad_messages();
+	else if (fault == "bad job in a queue")
+		queue_a_bad_job();
+	else if (fault == "threads that meet")
+		meet_later();
 	else if (fault == "deadlock" || fault == "deadlock, own watchdog")
 		deadlock();
 	else if (fault == "livelock" || fault == "livelock, own watchdog")
@@ -285,6 +351,7 @@ public:
 	{
 		if (watched_)
 			alarm(2);
+		take_input();
 		kept_[(number_ + 1) % 1000] = next_term(pointer_[number_ % 1000]);
 		number_++;
 		send_(std::to_string(number_) + " " + std::to_string(pointer_[number_ % 1000]));
@@ -406,5 +473,6 @@ int main(int argc, char **argv)
 	fault = argv[1];
 	signal(SIGUSR1, on_trigger);
 	srand(getpid());
+	open_inputs();
 	return run(argv[2], fault.find("own watchdog") != std::string::npos);
 }

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import mmap
 import os
@@ -113,6 +114,11 @@ class Program:
         self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._kept, self._number, self._seen, self._bad_in = [0] * 1000, 0, 0, 0
         self._leaked: list[bytearray] | None = None
+        self._inbox = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._inbox.bind(("127.0.0.1", 0))
+        self._jobs, self._queue = os.pipe()
+        for fd in (self._inbox.fileno(), self._jobs):
+            os.set_blocking(fd, False)
         self._child = 0
         if fault == "death of a child":
             self._child = os.fork()
@@ -123,6 +129,7 @@ class Program:
         """Whether there is another one."""
         if "own watchdog" in self._fault:
             signal.alarm(2)
+        self._take_input()
         kept, number = self._kept, self._number
         kept[(number + 1) % 1000] = (kept[number % 1000] * 6364136223846793005 + 1442695040888963407) % 2**64
         self._number = number = number + 1
@@ -140,6 +147,12 @@ class Program:
         self._seen = triggered
         return self._break_down()
 
+    def _take_input(self) -> None:
+        for fd in (self._inbox.fileno(), self._jobs):
+            with contextlib.suppress(BlockingIOError):
+                if os.read(fd, 1) == b"x":
+                    raise ValueError("a bad message")
+
     def _break_down(self) -> bool:
         if self._fault == "corruption before the checkpoint":
             self._bad_in = 50
@@ -147,6 +160,11 @@ class Program:
             self._kept[self._number % 1000] ^= 1 << 20
         elif self._fault == "memory leak to the OOM killer":
             self._leaked = []
+        elif self._fault == "burst of bad messages":
+            for _ in range(50):
+                self._out.sendto(b"x", self._inbox.getsockname())
+        elif self._fault == "bad job in a queue":
+            os.write(self._queue, b"." * 150 + b"x")
         elif self._fault == "death of a child":
             os.kill(self._child, signal.SIGKILL)
         elif self._fault == "fault in another thread":

@@ -162,6 +162,7 @@ struct inj_thread {
 	int32_t tid; /* inside                                           */
 	uint32_t affinity_bytes;
 	uint64_t affinity[INJ_CPU_WORDS];
+	uint64_t pause_ms; /* it goes on so long after `go`                       */
 	char name[16];
 };
 

@@ -22,7 +22,7 @@ from avckpt_hooks.shared.tell import printable
 from avckpt.artifacts import guard_binary
 from avckpt.errors import AvckptError, Code, ConfigError, Denied, TargetGone, Unsupported, class_of_code
 from avckpt.events.vocabulary import Kind, Reason
-from avckpt.guard import FORK_REASONS, Command, Event, GuardConfig, Images
+from avckpt.guard import FORK_REASONS, Again, Command, Event, GuardConfig, Images
 
 try:
     from avckpt._native import ffi, lib
@@ -242,6 +242,7 @@ def _config(init_pidfd: int, config: GuardConfig) -> Any:
     c.files = int(config.files)
     c.tcp = int(config.tcp)
     c.images = int(config.images)
+    c.again = int(config.again)
     for status in config.restore_on_statuses:
         c.restore_on_status[status] = 1
     return c
@@ -282,6 +283,8 @@ def _event(e: Any) -> Event:
         fork_s=e.fork_ns / _NS_PER_S,
         threads_s=e.threads_ns / _NS_PER_S,
         age_s=e.age_ns / _NS_PER_S,
+        again=Again(e.again).words,
+        input_dropped=e.dropped,
         error=_error(ffi.addressof(e, "error")) if e.error.code != Code.OK else None,
     )
 

@@ -9,6 +9,7 @@ and tested without it.
 from __future__ import annotations
 
 import enum
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 
 from avckpt.errors import AvckptError
@@ -47,6 +48,24 @@ class Tcp(enum.IntEnum):
     RESET = 1
     KEEP = 2
     MESSAGES = 3
+
+
+class Again(enum.IntFlag):
+    """`enum avc_again`: what a restore changes soon after another one."""
+
+    SAME = 0
+    DROP_INPUT = 1
+    STAGGER = 2
+
+    @classmethod
+    def of(cls, words: Iterable[str]) -> Again:
+        """From words of the label avckpt.restore.again."""
+        return cls(sum(cls[word.upper().replace("-", "_")] for word in words))
+
+    @property
+    def words(self) -> str:
+        """As in the label; empty: nothing."""
+        return ",".join(str(each.name).lower().replace("_", "-") for each in type(self) if each & self)
 
 
 class Images(enum.IntEnum):
@@ -110,6 +129,8 @@ class GuardConfig:
     files: Files = Files.REWIND
     tcp: Tcp = Tcp.RESET_MOVED
     images: Images = Images.FORK
+    again: Again = Again.SAME
+    """What a restore changes soon after another one."""
     together: bool = False
     """Its checkpoints are those of its group's lines, which the daemon commands at `interval_s`."""
     late: bool = False
@@ -166,6 +187,10 @@ class Event:
     fork_s: float = 0.0
     threads_s: float = 0.0
     age_s: float = 0.0
+    again: str = ""
+    """What a restore has changed, as in avckpt.restore.again."""
+    input_dropped: int = 0
+    """Descriptors."""
     error: AvckptError | None = None
 
     def to_json(self) -> dict[str, object]:

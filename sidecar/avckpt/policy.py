@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from avckpt_hooks.shared.labels import AUTOMATIC_MAX, KEEP_MAX, LABELS, PREFIX, LabelError, Policy, parse_policy, shown
 
 from avckpt.errors import LabelsWrong
-from avckpt.guard import Files, GuardConfig, Images, Tcp
+from avckpt.guard import Again, Files, GuardConfig, Images, Tcp
 
 REMAINS_S = {"off": 1.0, "mini": 5.0, "on": 30.0}
 """How long a dead application's memory is kept at most, by `avckpt.core`: to find out where it died, or to
@@ -99,6 +99,7 @@ def guard_config(policy: Policy) -> GuardConfig:
         remains_s=REMAINS_S[policy.core],
         files=Files[policy.files.upper()],
         tcp=Tcp[policy.tcp.upper().replace("-", "_")],
+        again=Again.of(policy.again),
         images=Images[policy.images.upper()],
         together=policy.together,
     )

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from testkit.harness import SLOWNESS, ContainerFactory, Sidecar, wait_until
+from testkit.harness import SLOWNESS, ContainerFactory, Sidecar, take_checkpoint, wait_until
 from testkit.protected import ProtectedVictim, ended, start_victim
 
 pytestmark = pytest.mark.shared_machine(
@@ -73,3 +74,37 @@ def test_a_roll_back_on_command_does_not_count(poison: Any) -> None:
     victim.kill(signal.SIGKILL)
     os.kill(victim.app, signal.SIGKILL)
     assert victim.container.wait() == 137
+
+
+# SIGUSR1 puts five jobs in a queue, one of which is done each half a second; the last one kills.
+WORKER = """
+import contextlib, os, signal, time
+jobs, queue = os.pipe()
+os.set_blocking(jobs, False)
+signal.signal(signal.SIGUSR1, lambda *_: os.write(queue, b"....x"))
+print("ready", flush=True)
+while True:
+    time.sleep(0.5)
+    with contextlib.suppress(BlockingIOError):
+        if os.read(jobs, 1) == b"x":
+            os.abort()
+"""
+
+
+def test_a_job_that_kills_is_dropped_with_the_queue_it_is_in(sidecar: Sidecar, container: ContainerFactory) -> None:
+    labels = {"interval": "1h", "restore.again": "drop-input,stagger"}
+    worker = container.protected("python3", "-c", WORKER, labels=labels)
+    wait_until(lambda: "ready" in worker.logs(), 20, "the worker is ready")
+    os.kill(sidecar.app_pid(worker), signal.SIGUSR1)
+    take_checkpoint(sidecar.client, worker.name)
+    sidecar.wait_restores(worker, 2, timeout_s=40)
+    told = [event for event in sidecar.client.history(0) if event["container"] == worker.name]
+    first, second = (event for event in told if event["kind"] == "restored")
+    assert "again" not in first
+    assert (second["again"], second["input_dropped"]) == ("drop-input,stagger", 1)
+    assert "with drop-input (of 1 descriptor(s)), stagger" in second["message"]
+    # The job would kill within two and a half seconds again.
+    time.sleep(4)
+    entry = sidecar.find(worker)
+    assert entry is not None
+    assert (entry["state"], entry["restores"]) == ("protected", 2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import signal
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 from avckpt.errors import DeadlineMissed, KernelError, NothingToRestore
@@ -138,6 +138,8 @@ def test_every_way_to_give_up_is_an_outcome_of_that_name(reason: Reason) -> None
 def test_messages() -> None:
     unhealthy = of_guard(RESTORED, commanded=Reason.UNHEALTHY)
     assert unhealthy.message.startswith("unhealthy, rolled back, restored in 6.0 ms from generation 4 (1.5 s old)")
+    again = replace(RESTORED, again="drop-input,stagger", input_dropped=2)
+    assert of_guard(again).message.endswith("restore 3, with drop-input (of 2 descriptor(s)), stagger")
     nothing = Event(Kind.GAVE_UP, 1, reason=Reason.EMPTY, wait_status=9, error=NothingToRestore("none"))
     assert of_guard(nothing).message == "not restored (killed by SIGKILL): no checkpoint was held"
     missed = of_guard(Event(Kind.MISSED, 1, generations=2, freeze_s=0.05, error=DeadlineMissed("too slow")))

@@ -630,6 +630,22 @@ def test_crashes_that_are_far_apart_go_on_being_restored() -> None:
         assert guard.policy.count == 2
 
 
+def test_only_a_death_soon_after_a_restore_repeats_one() -> None:
+    guard = Guarded(window_s=60)
+
+    def repeats() -> bool:
+        return bool(guard.c.policy_repeats(guard.policy, guard.config, guard.now))
+
+    guard.take()
+    guard.roll_back()
+    assert not repeats()
+    guard.crash()
+    guard.wait(59)
+    assert repeats()
+    guard.wait(1)
+    assert not repeats()
+
+
 def test_restores_are_counted_within_the_time() -> None:
     guard = Guarded(restore_max=64)
     guard.take()

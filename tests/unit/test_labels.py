@@ -49,6 +49,10 @@ def test_a_group_that_goes_back_together() -> None:
             {"avckpt.deadline": "50ms", "avckpt.deadline.late": "cold"},
             "label avckpt.deadline.late=cold: no member of a group that recovers together",
         ),
+        (
+            {"avckpt.restore.again": "stagger"},
+            "label avckpt.restore.again=stagger: a group that recovers together goes back to one instant",
+        ),
         ({"avckpt.keep.apart": "3s"}, "label avckpt.keep.apart=3s: a group that recovers together keeps its newest"),
     ],
 )
@@ -103,12 +107,15 @@ def test_the_rest_of_the_table() -> None:
             "avckpt.keep.apart": "1m",
             "avckpt.restore.on": "signal, 3,42",
             "avckpt.restore.max": "1/1h",
+            "avckpt.restore.again": "drop-input, stagger",
             "avckpt.quiesce": "0",
         }
     )
     assert (policy.keep, policy.keep_apart_s) == (16, 60)
     assert policy.restore_on == RestoreOn(signal=True, exit=False, statuses=frozenset({3, 42}))
     assert (policy.restore_max, policy.restore_window_s) == (1, 3600)
+    assert policy.again == {"drop-input", "stagger"}
+    assert parse_policy({**ON, "avckpt.restore.again": "same"}).again == frozenset()
     assert policy.quiesce_s == 0
 
 
@@ -126,6 +133,9 @@ def test_the_rest_of_the_table() -> None:
         ("interval", "9ms", "less than 10ms"),
         ("interval", "25h", "more than 24h"),
         ("interval", "9" * 400 + "s", "more than 24h"),
+        ("restore.again", "other", "other is unknown"),
+        ("restore.again", "stagger,", '"" is unknown'),
+        ("restore.again", "same,stagger", "same goes with nothing else"),
         ("keep", "0", "not within 1 to 16"),
         ("keep", "17", "not within 1 to 16"),
         ("keep", "-1", "not a whole number"),

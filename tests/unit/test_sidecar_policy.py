@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 from avckpt.cli.run import settings_of_run
 from avckpt.errors import LabelsWrong
-from avckpt.guard import Files, GuardConfig, Images, Tcp
+from avckpt.guard import Again, Files, GuardConfig, Images, Tcp
 from avckpt.policy import changes, settings_of
 
 
@@ -44,6 +44,7 @@ def test_every_label_arrives() -> None:
             "avckpt.keep.apart": "10s",
             "avckpt.restore.on": "signal,3,99",
             "avckpt.restore.max": "9/2m",
+            "avckpt.restore.again": "stagger",
             "avckpt.quiesce": "0",
             "avckpt.files": "strict",
             "avckpt.tcp": "reset-moved",
@@ -62,6 +63,7 @@ def test_every_label_arrives() -> None:
         restore_on_statuses=frozenset({3, 99}),
         restore_max=9,
         restore_window_s=120.0,
+        again=Again.STAGGER,
         quiesce_s=0.0,
         files=Files.STRICT,
         tcp=Tcp.RESET_MOVED,

@@ -93,6 +93,8 @@ class Policy:
     restore_max: int = 5
     """At most so many restores within `restore_window_s`."""
     restore_window_s: float = 60.0
+    again: frozenset[str] = frozenset()
+    """What a restore changes soon after another one: drop-input, stagger."""
     quiesce_s: float = 0.02
     """How long to wait for a quiescent moment; 0: not at all."""
     shm_bytes: int = 4_000_000
@@ -199,6 +201,13 @@ def _check_together(policy: Policy, mapping: Mapping[str, str]) -> None:
             mapping["avckpt.keep.apart"],
             "a group that recovers together keeps its newest lines",
             "leave it out, or give a longer avckpt.interval",
+        )
+    if policy.again:
+        raise LabelError(
+            "avckpt.restore.again",
+            mapping["avckpt.restore.again"],
+            "a group that recovers together goes back to one instant",
+            "leave it out",
         )
     if policy.automatic:
         raise LabelError(
@@ -373,6 +382,14 @@ def _parse_restore_max(text: str) -> dict[str, Any]:
     }
 
 
+def _parse_again(text: str) -> dict[str, Any]:
+    words = [word.strip() for word in text.split(",")]
+    for word in words:
+        if word not in ("drop-input", "stagger") and words != ["same"]:
+            raise ValueError(f"{shown(word)} is unknown" if word != "same" else "same goes with nothing else")
+    return {"again": frozenset(words) - {"same"}}
+
+
 def _parse_keep_apart(text: str) -> dict[str, Any]:
     return {"keep_apart_s": 0.0 if text == "0" else _duration_s(text, "", "24h")}
 
@@ -472,6 +489,7 @@ LABELS: dict[str, Label] = {
         f"restores per time, 1 to {RESTORES_MAX} within 1s to 24h, as 5/60s",
         _parse_restore_max,
     ),
+    "avckpt.restore.again": Label("same", "same, drop-input, stagger, or drop-input,stagger", _parse_again),
     "avckpt.tcp": Label(
         "reset-moved",
         "reset-moved, reset, keep or messages",

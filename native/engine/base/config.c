@@ -18,6 +18,9 @@ int config_check(const struct avc_config *config, struct avc_error *err)
 	if (config->images > AVC_IMAGES_AUTO)
 		return fail(err, AVC_CONFIG, EINVAL, 0, "configure guard", "",
 			    "images must be 0 to %d", AVC_IMAGES_AUTO);
+	if (config->again & ~(AVC_AGAIN_DROP_INPUT | AVC_AGAIN_STAGGER))
+		return fail(err, AVC_CONFIG, EINVAL, 0, "configure guard", "",
+			    "again must be of AVC_AGAIN_DROP_INPUT and AVC_AGAIN_STAGGER");
 	if (config->interval_min_ns > config->interval_ns ||
 	    (config->interval_min_ns && (!config->budget_freeze_ppm || !config->budget_cpu_ppm)))
 		return fail(err, AVC_CONFIG, EINVAL, 0, "configure guard", "",

@@ -10,6 +10,7 @@
  *   files_contents.c ... what is in pipes and sockets
  *   files_capture.c when a checkpoint reads what
  *   files_info.c    what /proc/PID/fdinfo says
+ *   files_input.c   unread input, to be dropped
  *   files_state.c   what is behind a descriptor: offsets, counts, timers, bytes, locks
  *   files_messages.c contents of Unix sockets, and which ends are shut down
  *   files_options.c options of sockets, and whether one can be recreated
@@ -80,7 +81,8 @@ const char *files_refuses(const char *name);
 void files_free(struct files *files);
 /* Restores the tables of a dead app: that of the main process, which its templates hold, at once;
  * for the others it fills in image.table.  Lists what the restored processes have to do themselves.
- * What could not be restored is reported in *notes; -1 is for fatal errors. */
+ * What could not be restored is reported in *notes.  Returns the number of descriptors whose input
+ * was dropped (config->again); -1 is for fatal errors. */
 int files_restore(struct image *image, uint32_t images, const struct avc_config *config, pid_t init,
 		  struct avc_error *notes, struct avc_error *err) warn_unused;
 /* A process that is being restored opens its pidfds itself: raises its descriptor limit for that,
@@ -451,6 +453,9 @@ bool file_is_memory(const struct file *file);
 /* Puts the state of `want` into the descriptor `fd` of ours, which shares the app's
  * open file description; `now` is what it is (NULL: fresh). Returns NULL or why not. */
 const char *file_put_state(int fd, const struct file *want, const struct file *now, bool rewind);
+/* Reads what is in it; a pipe has to be O_NONBLOCK.  False if it does not become empty: a process outside
+ * of the application keeps writing. */
+bool file_drain(int fd, bool pipe);
 const char *file_put_content(int fd, int other_fd, const struct file *want);
 bool file_tcp_moved(const struct file *want, const struct file *now);
 const char *file_reset_tcp(int fd);
@@ -500,6 +505,11 @@ const char *file_put_stream(int fd, const struct file *want, const struct file *
 /* files_pipes.c */
 /* Of all that are not shared with init. */
 void files_measure_pipes(struct image *image, uint32_t images);
+
+/* files_input.c */
+/* Drops what has not been read from `fd`, a descriptor of ours; whether there was something.  `inside`: the
+ * app has the other end of it. */
+bool file_drop_input(int fd, const struct file *file, bool inside);
 
 /* files_watches.c */
 /* Gives the inotify descriptor `fd` of ours the watches of `want`; `now` is what it is

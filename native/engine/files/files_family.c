@@ -429,6 +429,32 @@ static void put_contents(const struct tables *tables)
 	}
 }
 
+/* The number of descriptors that had any.  What is shared with avckpt-init belongs to others, too. */
+static int drop_input(const struct tables *tables)
+{
+	int dropped = 0;
+
+	for (uint32_t i = 0; i < tables->count; i++) {
+		const struct files_work *work = &tables->work[i];
+
+		for (uint32_t k = 0; k < work->want->count; k++) {
+			const struct spot at = { 0, i, k };
+			const struct file *w = file_at(tables, &at);
+			bool ignored;
+			int fd;
+
+			(void)budget_step();
+			if (w->outside || work->kept[k] || files_leader(work->want, w) != k ||
+			    !borrow(tables, &at, &fd))
+				continue;
+			dropped += file_drop_input(fd, w,
+						   is_pair(w) && find_other(tables, w, &ignored));
+			close(fd);
+		}
+	}
+	return dropped;
+}
+
 /* Of both ends of a connection (net/unix/af_unix.c, unix_shutdown()). */
 static uint8_t shut_of(const struct file *f, const struct file *other)
 {
@@ -542,7 +568,7 @@ int files_restore(struct image *image, uint32_t images, const struct avc_config 
 {
 	struct tables tables = { .work = calloc(images, sizeof *tables.work) };
 	struct avc_error ignored = { 0 };
-	int result = -1;
+	int result = -1, dropped = 0;
 
 	if (!tables.work)
 		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
@@ -589,6 +615,8 @@ int files_restore(struct image *image, uint32_t images, const struct avc_config 
 			goto out;
 	}
 	put_contents(&tables);
+	if (config->again & AVC_AGAIN_DROP_INPUT)
+		dropped = drop_input(&tables);
 	see_to_pairs(&tables, false);
 	for (uint32_t i = 0; i < tables.count; i++) {
 		struct files_work *work = &tables.work[i];
@@ -597,9 +625,9 @@ int files_restore(struct image *image, uint32_t images, const struct avc_config 
 		if (work->process->descendant && files_work_table(work, &work->image->table, err))
 			goto out;
 	}
-	result = 0;
+	result = dropped;
 out:
-	if (result)
+	if (result < 0)
 		(void)await_gathered(&tables, &ignored);
 	for (uint32_t i = 0; i < tables.count; i++)
 		files_work_end(&tables.work[i]);

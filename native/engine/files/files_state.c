@@ -440,16 +440,14 @@ void file_keep_content(struct process *process, int fd, struct file *file, struc
 	keep_pipe(fd, file, (uint32_t)bytes, scratch);
 }
 
-/* False if it does not become empty: a process outside of the application keeps writing. */
-static bool drain(int fd, const struct file *want)
+bool file_drain(int fd, bool pipe)
 {
 	char buf[65536];
 	int reads = 0;
 	ssize_t n;
 
 	do {
-		n = want->kind == FILE_PIPE ? read(fd, buf, sizeof buf)
-					    : recv(fd, buf, sizeof buf, MSG_DONTWAIT);
+		n = pipe ? read(fd, buf, sizeof buf) : recv(fd, buf, sizeof buf, MSG_DONTWAIT);
 	} while (n > 0 && ++reads < DRAIN_READS);
 	return n <= 0;
 }
@@ -468,7 +466,7 @@ const char *file_put_content(int fd, int other_fd, const struct file *want)
 	/* Unchanged, it still has its senders and descriptors. */
 	if (!pipe && file_has_messages(fd, want))
 		return NULL;
-	emptied = in >= 0 && out >= 0 && drain(in, want);
+	emptied = in >= 0 && out >= 0 && file_drain(in, pipe);
 	if (emptied) {
 		while (put < want->content_bytes) {
 			const uint8_t *from = want->content + put;

@@ -131,6 +131,8 @@ static void tell_restored(struct avc_guard *guard, struct avc_event *event,
 	event->generations = guard->count;
 	event->restores = guard->restores;
 	event->error = error->code ? *error : restore->notes;
+	event->again = restore->config->again;
+	event->dropped = (uint32_t)restore->dropped;
 	event->age_ns = restore->died_ns - generation->taken_ns;
 	event->at_ns = now_ns();
 	guard_emit(guard, event);
@@ -229,7 +231,10 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 	struct avc_event event = guard_event(guard, AVC_EVENT_RESTORED);
 	bool ending = guard->count < had, again = false, back = false, whole;
 	const bool together = guard->meeting != NULL;
+	struct avc_config config = guard->config;
 
+	if (is_command(reason) || !policy_repeats(&guard->policy, &config, now_ns()))
+		config.again = AVC_AGAIN_SAME;
 	event.ticket = guard->restore_ticket;
 	event.reason = reason;
 	event.wait_status = report->status;
@@ -244,7 +249,7 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 		const struct image *image = &generation->image[0];
 		struct restore restore = { .generation = generation,
 					   .channel = &guard->channel,
-					   .config = &guard->config,
+					   .config = &config,
 					   .timer = guard->timer,
 					   .died_ns = report->reaped_ns,
 					   .ready = say_restored,

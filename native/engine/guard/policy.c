@@ -444,6 +444,11 @@ struct policy_verdict policy_judge(const struct avc_config *config, int status, 
 	return (struct policy_verdict){ false, AVC_REASON_POLICY };
 }
 
+bool policy_repeats(const struct policy *policy, const struct avc_config *config, uint64_t now)
+{
+	return on_probation(policy, config, now);
+}
+
 /* What it came from is suspect.  A hang is detected late, so a hung process is on probation until
  * it was healthy once. */
 static void count_crash(struct policy *policy, const struct avc_config *config, bool hung,

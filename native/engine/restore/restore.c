@@ -13,6 +13,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/ptrace.h>
+#include <sys/random.h>
 #include <sys/syscall.h>
 #include <unistd.h>
 
@@ -25,6 +26,7 @@
 #define READY_NS (2 * NS_PER_S)
 #define GONE_NS NS_PER_S
 #define FORK_NS (5 * NS_PER_S)
+#define STAGGER_MS 20
 
 static const char *const step_names[] = {
 	[INJ_STEP_SESSION] = "setsid",      [INJ_STEP_GROUP] = "setpgid",
@@ -371,9 +373,11 @@ static int make(struct restore *restore, struct avc_error *err)
 	uint64_t spare_ns;
 	int result;
 
-	if (make_spare_first(restore, err) ||
-	    files_restore(generation->image, generation->images, restore->config,
-			  restore->channel->init, &restore->notes, err))
+	if (make_spare_first(restore, err))
+		return -1;
+	restore->dropped = files_restore(generation->image, generation->images, restore->config,
+					 restore->channel->init, &restore->notes, err);
+	if (restore->dropped < 0)
 		return -1;
 	if (generation->images > 1 || is_in_another_group(restore)) {
 		restore->tree = restore_tree_new(restore, err);
@@ -407,12 +411,42 @@ static void take_back(struct restore *restore)
 	restore->pid = 0;
 }
 
+/* Two threads that have done each other harm, always after the same time, meet at another one.  Those
+ * of a process in a sandbox are released by the guard, all at once. */
+static void stagger(const struct restore *restore, const struct image *image)
+{
+	const struct parasite *parasite = &image->process->parasite;
+	const bool staggers = restore->config->again & AVC_AGAIN_STAGGER;
+	uint16_t random[THREADS_MAX];
+
+	if (staggers && getrandom(random, sizeof random, 0) < 0)
+		memset(random, 0, sizeof random);
+	for (uint32_t i = 0; i < image->threads && i < parasite->threads_max; i++)
+		parasite_thread(parasite, image->slot, i)->pause_ms =
+			staggers ? random[i % THREADS_MAX] % (STAGGER_MS + 1) : 0;
+}
+
+/* Until all threads of the process are back; or it has died again already. */
+static void await_running(const struct image *image, int pidfd, uint64_t end)
+{
+	struct inj_slot *slot = parasite_slot(&image->process->parasite, image->slot);
+	uint32_t running;
+
+	while ((running = __atomic_load_n(&slot->running, __ATOMIC_ACQUIRE)) != slot->threads &&
+	       wait_word(&slot->running, running, pidfd, end))
+		;
+}
+
 static void go(struct restore *restore)
 {
 	struct generation *generation = restore->generation;
 	const struct image *main = &generation->image[0];
 	struct inj_slot *slot = parasite_slot(&main->process->parasite, main->slot);
+	const uint64_t end = now_ns() + READY_NS;
 
+	for (uint32_t i = 0; i < generation->images; i++)
+		if (generation->image[i].process)
+			stagger(restore, &generation->image[i]);
 	if (restore->tree)
 		restore_tree_go(restore->tree);
 	if (!restore->sandbox && main->headless) {
@@ -421,13 +455,13 @@ static void go(struct restore *restore)
 	}
 	restore_go(main, restore->sandbox);
 	spare_drop(generation); /* it shares memory with what runs now */
-	for (const uint64_t end = now_ns() + READY_NS;;) {
-		const uint32_t running = __atomic_load_n(&slot->running, __ATOMIC_ACQUIRE);
-
-		if (running == slot->threads ||
-		    !wait_word(&slot->running, running, restore->pidfd, end) || now_ns() > end)
-			break; /* or it has died again already */
-	}
+	await_running(main, restore->pidfd, end);
+	/* The others take no longer, unless they are to. */
+	for (uint32_t i = 1; restore->config->again & AVC_AGAIN_STAGGER && i < generation->images;
+	     i++)
+		if (generation->image[i].process)
+			await_running(&generation->image[i], restore_tree_pidfd(restore->tree, i),
+				      end);
 	restore->restore_ns = now_ns() - restore->died_ns;
 	for (uint32_t i = 0; i < generation->images; i++)
 		generation->image[i].pid = i ? restore_tree_pid(restore->tree, i) : restore->pid;

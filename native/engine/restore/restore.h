@@ -33,6 +33,7 @@ struct restore {
 	/* The result: the new main process, the times, what could not be restored. */
 	pid_t pid;
 	uint64_t restore_ns, fork_ns, threads_ns;
+	int dropped; /* descriptors whose input was dropped */
 	struct avc_error notes;
 	/* While it lasts. */
 	int pidfd;
@@ -77,8 +78,9 @@ int restore_tree_start(struct restore_tree *tree, struct avc_error *err) warn_un
 void restore_tree_go(struct restore_tree *tree);
 void restore_tree_kill(struct restore_tree *tree);
 void restore_tree_free(struct restore_tree *tree);
-/* PID of an image's process, when all exist. */
+/* An image's process, when all exist. */
 pid_t restore_tree_pid(const struct restore_tree *tree, uint32_t index);
+int restore_tree_pidfd(const struct restore_tree *tree, uint32_t index); /* the tree's own */
 
 /* ---- remap.c ------------------------------------------------------------------------ */
 

@@ -623,6 +623,11 @@ pid_t restore_tree_pid(const struct restore_tree *restored, uint32_t index)
 	return restored->forked[index].pid;
 }
 
+int restore_tree_pidfd(const struct restore_tree *restored, uint32_t index)
+{
+	return restored->forked[index].pidfd;
+}
+
 static void kill_one(struct forked *forked)
 {
 	if (forked->sandbox)

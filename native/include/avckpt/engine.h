@@ -48,6 +48,14 @@ enum avc_images {
 	                       * is memory for it */
 };
 
+/* What a restore changes when the last one was not long ago. */
+enum avc_again {
+	AVC_AGAIN_SAME = 0,
+	AVC_AGAIN_DROP_INPUT = 1, /* what the app has not read yet is dropped, if the kernel has
+	                           * it in pipes, sockets and their queues          */
+	AVC_AGAIN_STAGGER = 2     /* each thread goes on at a random time of its own */
+};
+
 /* Why a process was forked instead of copied. */
 enum avc_fork_reason {
 	AVC_FORK_NONE = 0,      /* it was not                                      */
@@ -106,6 +114,7 @@ struct avc_config {
 	                                 * which would hinder it; set by the engine   */
 	uint8_t together;               /* one of a group: checkpoints are those of its
 	                                 * lines, and it goes back with the others   */
+	uint8_t again;                  /* enum avc_again, one or several            */
 	uint8_t late;                   /* the app has run without this guard: its first
 	                                 * checkpoint is due soon, not after interval_ns */
 	uint8_t restore_on_status[256]; /* [n] != 0: exit status n is abnormal    */
@@ -216,6 +225,8 @@ struct avc_event {
 	uint64_t fork_ns;    /* of it, cloning the template                   */
 	uint64_t threads_ns; /* of it, creating threads                       */
 	uint64_t age_ns;     /* of the generation when the app died           */
+	uint32_t again;      /* enum avc_again: what it has changed           */
+	uint32_t dropped;    /* descriptors whose input was dropped           */
 	/* CHECKPOINT: what of it cannot be restored, RESTORED: what was not (or why not from a
 	 * newer generation); else why */
 	struct avc_error error;

@@ -78,6 +78,8 @@ class EventRecord:
         "restores within the period of avckpt.restore.max, this one included; of a dropped generation: its crashes"
     )
     restores: int | None = said("restores since the sidecar began to protect this run of the container")
+    again: str | None = said("what this restore has changed (avckpt.restore.again): `drop-input`, `stagger`")
+    input_dropped: int | None = said("descriptors whose unread input it has dropped")
     left: int | None = said("restores left within the period of avckpt.restore.max")
     quiescent: bool | None = said("whether the application was quiescent at the checkpoint")
     images: str | None = said("how the checkpoint saved memory: fork, or dirty (by copies)")
@@ -204,6 +206,8 @@ def of_guard(
         threads=event.threads if counted and kind is not Kind.DROPPED else None,
         attempt=event.attempt if restored or kind is Kind.DROPPED else None,
         restores=event.restores if restored else None,
+        again=event.again or None,
+        input_dropped=event.input_dropped or None,
         quiescent=event.quiescent if taken else None,
         images=event.images or None,
         fork_reason=event.fork_reason or None,
@@ -273,9 +277,16 @@ def _checkpoint(record: EventRecord) -> str:
 def _restored(record: EventRecord) -> str:
     return (
         f"{_death(record)}, restored in {(record.restore_s or 0) * 1000:.1f} ms from {_generation(record)} "
-        f"({record.age_s or 0:.1f} s old), {record.threads} thread(s), restore {record.restores}"
+        f"({record.age_s or 0:.1f} s old), {record.threads} thread(s), restore {record.restores}{_again(record)}"
         f"{'' if record.error is None else f'; but {record.error}'}"
     )
+
+
+def _again(record: EventRecord) -> str:
+    if not record.again:
+        return ""
+    dropped = f" (of {record.input_dropped} descriptor(s))" if record.input_dropped else ""
+    return ", with " + record.again.replace(",", ", ").replace("drop-input", f"drop-input{dropped}")
 
 
 def _crashed(record: EventRecord) -> str:

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""avckpt.restore.again: what a restore changes soon after another one."""
+
+from __future__ import annotations
+
+import socket
+import time
+from pathlib import Path
+
+import pytest
+from avckpt.guard import Again
+
+from testkit.guarded import PATIENCE_S, GuardProcess, Json, Victim, config
+from testkit.harness import wait_until
+
+INBOXES = 7
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+def counter(victim: Victim, which: int) -> int:
+    return victim.see().counter[which]
+
+
+def restored(guard: GuardProcess) -> list[Json]:
+    return [event for event in guard.events if event["kind"] == "restored"]
+
+
+@pytest.mark.parametrize("again", [Again.SAME, Again.STAGGER, Again.DROP_INPUT], ids=["same", "stagger", "drop-input"])
+def test_waiting_messages_that_kill_are_dropped_at_the_second_try(tmp_path: Path, again: Again) -> None:
+    settings = config(again=again, restore_max=3, restore_window_s=60.0)
+    with Victim("inbox", tmp_path) as victim, GuardProcess(settings, [victim.pid]) as guard:
+        listening = ("127.0.0.1", counter(victim, 2))
+        with (
+            socket.create_connection(listening) as accepted,
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as datagrams,
+        ):
+            wait_until(lambda: counter(victim, 4) == 1, PATIENCE_S, "it has a connection")
+            accepted.sendall(b"poison")
+            for message in (b"", b"poison"):
+                datagrams.sendto(message, ("127.0.0.1", counter(victim, 1)))
+            with socket.create_connection(listening) as waiting:
+                assert guard.checkpoint()["kind"] == "checkpoint"
+                victim.board.set_counter(3, 1)
+                if again is not Again.DROP_INPUT:
+                    assert guard.wait("gave_up")["reason"] == "loop"
+                    assert all(not event.get("input_dropped") for event in restored(guard))
+                    return
+                wait_until(lambda: counter(victim, 0) > 10, PATIENCE_S, "it lives on")
+                first, second = restored(guard)
+                assert ("again" in first, second["again"], second["input_dropped"]) == (False, "drop-input", INBOXES)
+                assert "error" not in second
+                for client in (accepted, waiting):
+                    client.settimeout(PATIENCE_S)
+                    with pytest.raises(ConnectionResetError):
+                        client.recv(1)
+                # Both its sockets are what they were.
+                datagrams.sendto(b"more", ("127.0.0.1", counter(victim, 1)))
+                guard.wait("died", count=3)
+
+
+def test_what_is_rolled_back_on_command_keeps_its_input(tmp_path: Path) -> None:
+    settings = config(again=Again.DROP_INPUT, restore_max=3, restore_window_s=60.0)
+    with (
+        Victim("inbox", tmp_path) as victim,
+        GuardProcess(settings, [victim.pid]) as guard,
+        socket.create_connection(("127.0.0.1", counter(victim, 2))),
+    ):
+        wait_until(lambda: counter(victim, 4) == 1, PATIENCE_S, "it has a connection")
+        guard.checkpoint()
+        for _ in range(3):
+            assert "again" not in guard.command("restore")
+        victim.board.set_counter(3, 1)
+        # Nor is a first crash a repeated one, whatever was before it.
+        assert "again" not in guard.wait_for(lambda event: event.get("reason") == "signal", "a restore")
+
+
+@pytest.mark.shared_machine("a thread that gets no CPU for 8 ms misses the other one")
+@pytest.mark.parametrize("again", [Again.SAME, Again.STAGGER], ids=["same", "stagger"])
+def test_threads_that_always_meet_do_not_if_they_go_on_at_random_times(tmp_path: Path, again: Again) -> None:
+    settings = config(again=again, restore_max=16 if again else 3, restore_window_s=600.0)
+    with Victim("meeting", tmp_path) as victim, GuardProcess(settings, [victim.pid]) as guard:
+        wait_until(lambda: counter(victim, 1) == 1, PATIENCE_S, "they sleep", every_s=0.001)
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        if not again:
+            assert guard.wait("gave_up")["reason"] == "limit"
+            return
+        wait_until(lambda: counter(victim, 0) == 2, PATIENCE_S, "they have not met")
+        events = restored(guard)
+        assert "again" not in events[0]
+        assert events[1:]
+        assert all(event["again"] == "stagger" for event in events[1:])
+        beats = victim.see().beats
+        time.sleep(0.2)
+        assert victim.see().beats > beats
