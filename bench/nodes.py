@@ -194,8 +194,10 @@ def start(sidecar: LocalSidecar, folder: Path, stack: ExitStack, options: argpar
         others = ["-e", "ROS_PACKAGE_PATH=/bench:/usr/share", "-e", "ROS_MASTER_URI=http://localhost:11311"]
     elif options.launcher == "ros2":
         (folder / "all.launch.py").write_text(LAUNCH_PY.format(nodes=options.nodes))
-        command = [f"{options.ros2}/bin/ros2", "launch", "/bench/all.launch.py"]
-        others = ["-v", f"{options.ros2}:{options.ros2}:ro", "-e", f"AMENT_PREFIX_PATH={options.ros2}"]
+        command = ["python3", f"{options.ros2}/bin/ros2", "launch", "/bench/all.launch.py"]
+        libraries = ":".join(map(str, options.ros2.glob("lib/python3*/site-packages")))
+        others = ["-v", f"{options.ros2}:{options.ros2}:ro", "-e", f"PYTHONPATH={libraries}"]
+        others += ["-e", f"AMENT_PREFIX_PATH={options.ros2}"]
     labels = {"scope": "nodes", "restore.max": "64/1s", "restore.on": "signal,exit", "files": "rewind"}
     if options.interval:
         labels["interval"] = options.interval

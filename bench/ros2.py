@@ -235,7 +235,8 @@ class HeardLog:
     def gaps(self, killed_ns: int) -> tuple[float | None, float | None, float]:
         """out, in, and the largest one of the time before; ms."""
         before = [r for r in self.read() if r[0] <= killed_ns]
-        last_out, last_in = before[-1][0], max(r[3] for r in before[-100:])
+        # One that goes back, too, may have been about to write down a message that it heard before the line.
+        last_out, last_in = max(r[0] for r in before[-100:]), max(r[3] for r in before[-100:])
         out = heard = None
         for now, _, sent, heard_ns in self.read():
             if out is None and sent > killed_ns:
