@@ -419,7 +419,7 @@ __attribute__((section(".text.entry"))) void inj_end(void)
 
 /* Waits for the engine's `go`. An engine that died never sends it: then init ends the container,
  * and this process must not linger. */
-static void wait_for_go(struct inj_slot *slot, enum inj_go stage, uint64_t pause_ms)
+static void wait_for_go(struct inj_slot *slot, enum inj_go stage, const struct inj_thread *t)
 {
 	uint32_t go;
 
@@ -427,8 +427,9 @@ static void wait_for_go(struct inj_slot *slot, enum inj_go stage, uint64_t pause
 		if (futex_wait(&slot->go, go, INJ_GO_S * 1000) == -110 /* ETIMEDOUT */)
 			leave();
 	}
-	if (pause_ms)
-		futex_wait(&slot->go, go, pause_ms);
+	/* Set with `go`. */
+	if (t->pause_ms)
+		futex_wait(&slot->go, go, t->pause_ms);
 	__atomic_add_fetch(&slot->running, 1, __ATOMIC_ACQ_REL);
 	if (__atomic_load_n(&slot->running, __ATOMIC_ACQUIRE) == slot->threads)
 		futex_wake(&slot->running);
@@ -439,7 +440,7 @@ void inj_thread(struct inj_slot *slot, struct inj_thread *t)
 	set_up(slot, t);
 	if (__atomic_add_fetch(&slot->ready, 1, __ATOMIC_ACQ_REL) == slot->threads)
 		futex_wake(&slot->ready);
-	wait_for_go(slot, INJ_GO_ALL, t->pause_ms);
+	wait_for_go(slot, INJ_GO_ALL, t);
 	inj_sigreturn(t->frame);
 }
 
@@ -536,9 +537,9 @@ __attribute__((section(".text.entry"))) void inj_restore(struct inj_slot *slot)
 	run_setup(slot, me->tid, slot->setup[INJ_AFTER]);
 	say(slot, INJ_READY);
 	if (!me->frame) {
-		wait_for_go(slot, INJ_GO_ENDED, 0);
+		wait_for_go(slot, INJ_GO_ENDED, me);
 		inj_end();
 	}
-	wait_for_go(slot, INJ_GO_ALL, me->pause_ms);
+	wait_for_go(slot, INJ_GO_ALL, me);
 	inj_sigreturn(me->frame);
 }
