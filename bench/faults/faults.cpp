@@ -62,7 +62,6 @@ static volatile int *volatile null_pointer;
 static volatile int zero, sink;
 static Shape *volatile shape = new Shape;
 static int (*volatile function)() = nullptr;
-static int queue = -1;
 
 // As the compiler must not see that it ends nowhere.
 __attribute__((noinline)) static int recurse(int n)
@@ -87,7 +86,7 @@ static bool work_is_there;
 static std::map<int, int> shared_map;
 
 // What it is sent, and does a part of with each term: by others, and by itself.
-static int inputs[2] = { -1, -1 };
+static int inputs[2], queue;
 static sockaddr_in input_at;
 
 static void open_inputs()

@@ -634,7 +634,7 @@ def test_only_a_death_soon_after_a_restore_repeats_one() -> None:
     guard = Guarded(window_s=60)
 
     def repeats() -> bool:
-        return bool(guard.c.policy_repeats(guard.policy, guard.config, guard.now))
+        return bool(guard.c.policy_on_probation(guard.policy, guard.config, guard.now))
 
     guard.take()
     guard.roll_back()

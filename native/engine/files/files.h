@@ -510,6 +510,11 @@ void files_measure_pipes(struct image *image, uint32_t images);
 /* Drops what has not been read from `fd`, a descriptor of ours; whether there was something.  `inside`: the
  * app has the other end of it. */
 bool file_drop_input(int fd, const struct file *file, bool inside);
+/* Resets the connections that wait to be accepted; whether there were any. */
+bool file_turn_away(int fd);
+/* Reads what is in a socket, and forgets it; whether there was something.  Messages may be empty; `ends`:
+ * nothing means that the other end is closed. */
+bool file_empty_socket(int fd, bool ends);
 
 /* files_watches.c */
 /* Gives the inotify descriptor `fd` of ours the watches of `want`; `now` is what it is

@@ -29,9 +29,8 @@
 #include "avckpt/guard.h"
 #include "files.h"
 
-#define EMPTY_NS (100 * NS_PER_MS) /* of one socket; outsiders may keep sending to it      */
-#define COMES_NS (2 * NS_PER_MS)   /* of all, while everything is stopped                */
-#define MEND_NS (500 * NS_PER_MS)  /* of all, when everything is dead                     */
+#define COMES_NS (2 * NS_PER_MS)  /* of all, while everything is stopped                */
+#define MEND_NS (500 * NS_PER_MS) /* of all, when everything is dead                     */
 #define LOOK_US 20
 #define COUNT_TRIES 16
 #define ENDS_MAX 1024
@@ -60,34 +59,6 @@ struct group_ends {
 	struct group_end end[ENDS_MAX];
 };
 
-static void empty(int fd)
-{
-	const uint64_t end = now_ns() + EMPTY_NS;
-	char buf[4096];
-
-	while (recv(fd, buf, sizeof buf, MSG_DONTWAIT | MSG_TRUNC) > 0 && now_ns() < end)
-		(void)budget_step();
-}
-
-/* Data on a connection that is not accepted yet may be invalid now.  The restore resets O_NONBLOCK
- * with all other flags. */
-static void turn_away(int fd)
-{
-	const struct linger reset = { .l_onoff = 1 };
-	const uint64_t end = now_ns() + EMPTY_NS;
-	int caller = 0;
-
-	if (fcntl(fd, F_SETFL, fcntl(fd, F_GETFL) | O_NONBLOCK))
-		return;
-	while (caller >= 0 && now_ns() < end) {
-		caller = accept4(fd, NULL, NULL, SOCK_CLOEXEC);
-		if (caller < 0)
-			break;
-		setsockopt(caller, SOL_SOCKET, SO_LINGER, &reset, sizeof reset);
-		close(caller);
-	}
-}
-
 /* Data in flight at the checkpoint that has arrived since counts, too. */
 static bool has_moved(int fd, const struct file *then)
 {
@@ -105,13 +76,14 @@ static void forget(int fd, const struct file *then, const struct avc_config *con
 	if (s->domain != AF_UNIX && s->domain != AF_INET && s->domain != AF_INET6)
 		return;
 	if (s->listening) {
-		turn_away(fd);
+		/* Data on a connection that is not accepted yet may be invalid now. */
+		(void)file_turn_away(fd);
 	} else if (s->type == SOCK_DGRAM) {
 		if (s->domain != AF_UNIX || file_has_name(s))
-			empty(fd);
+			(void)file_empty_socket(fd, false);
 	} else if (s->domain == AF_UNIX && s->connected && file_has_name(s)) {
 		shutdown(fd, SHUT_RDWR);
-		empty(fd);
+		(void)file_empty_socket(fd, true);
 	} else if (s->protocol == IPPROTO_TCP && (s->connected || then->tcp_state) &&
 		   (config->tcp == AVC_TCP_RESET || has_moved(fd, then))) {
 		/* This discards unread data, also if the connection is closed. */
@@ -487,7 +459,7 @@ static bool try_show(struct group_end *end, struct avc_board *board)
 		return false;
 	end->why = "its other end cannot be restored";
 	if (!is_tcp(end))
-		empty(end->fd);
+		(void)file_empty_socket(end->fd, true);
 	show(end, board, written);
 	if (end->shown < 0 || put_on_board(end, board))
 		return end->shown >= 0;

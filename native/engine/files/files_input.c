@@ -11,22 +11,14 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <netinet/in.h>
-#include <poll.h>
 #include <sys/ioctl.h>
 #include <sys/socket.h>
 #include <unistd.h>
 
 #include "files.h"
 
-#define WAITING_MAX 65536 /* connections, or messages */
+#define EMPTY_NS (100 * NS_PER_MS) /* of one socket; outsiders may keep sending to it */
 #define ERRORS_MAX 3
-
-static bool has_input(int fd)
-{
-	struct pollfd state = { .fd = fd, .events = POLLIN };
-
-	return poll_for(&state, 1, 0) > 0 && state.revents & POLLIN;
-}
 
 static bool has_bytes(int fd)
 {
@@ -35,28 +27,47 @@ static bool has_bytes(int fd)
 	return ioctl(fd, FIONREAD, &bytes) == 0 && bytes > 0;
 }
 
-/* With nothing lingering, close(2) resets it. */
-static bool end_waiting(int fd)
+/* With nothing lingering, close(2) resets them.  Other containers' processes that have the socket, too,
+ * may accept what was there: so it must not block. */
+bool file_turn_away(int fd)
 {
-	const struct linger at_once = { .l_onoff = 1, .l_linger = 0 };
+	const struct linger reset = { .l_onoff = 1 };
+	const uint64_t end = now_ns() + EMPTY_NS;
 	const int flags = fcntl(fd, F_GETFL);
-	bool ended = false;
+	bool any = false;
 
-	if (flags < 0 || !has_input(fd))
+	if (flags < 0 || fcntl(fd, F_SETFL, flags | O_NONBLOCK))
 		return false;
-	/* Another container's process that has the socket, too, may accept what was there. */
-	(void)fcntl(fd, F_SETFL, flags | O_NONBLOCK);
-	for (int i = 0; i < WAITING_MAX; i++) {
-		const int connection = accept4(fd, NULL, NULL, SOCK_CLOEXEC);
+	while (now_ns() < end) {
+		const int caller = accept4(fd, NULL, NULL, SOCK_CLOEXEC);
 
-		if (connection < 0)
+		if (caller < 0)
 			break;
-		(void)setsockopt(connection, SOL_SOCKET, SO_LINGER, &at_once, sizeof at_once);
-		close(connection);
-		ended = true;
+		(void)setsockopt(caller, SOL_SOCKET, SO_LINGER, &reset, sizeof reset);
+		close(caller);
+		any = true;
 	}
 	(void)fcntl(fd, F_SETFL, flags);
-	return ended;
+	return any;
+}
+
+bool file_empty_socket(int fd, bool ends)
+{
+	const uint64_t end = now_ns() + EMPTY_NS;
+	bool any = false;
+	int errors = 0;
+	char buf[4096];
+
+	while (errors < ERRORS_MAX && now_ns() < end) {
+		const ssize_t bytes = recv(fd, buf, sizeof buf, MSG_DONTWAIT | MSG_TRUNC);
+
+		if ((bytes < 0 && errno == EAGAIN) || (!bytes && ends))
+			break;
+		errors += bytes < 0; /* one that was pending, as ECONNREFUSED */
+		any |= bytes >= 0;
+		(void)budget_step();
+	}
+	return any;
 }
 
 static bool end_connection(int fd, int domain)
@@ -67,36 +78,16 @@ static bool end_connection(int fd, int domain)
 						       : shutdown(fd, SHUT_RDWR) == 0;
 }
 
-/* They may be empty.  `ends`: nothing then means that the other end is closed. */
-static bool drop_messages(int fd, bool ends)
-{
-	bool dropped = false;
-	int errors = 0;
-	char byte;
-
-	for (int i = 0; i < WAITING_MAX && errors < ERRORS_MAX; i++) {
-		const ssize_t bytes = recv(fd, &byte, sizeof byte, MSG_DONTWAIT);
-
-		if ((bytes < 0 && errno == EAGAIN) || (!bytes && ends))
-			break;
-		errors += bytes < 0; /* one that was pending, as ECONNREFUSED */
-		dropped |= bytes >= 0;
-	}
-	return dropped;
-}
-
 static bool drop_from_socket(int fd, bool inside)
 {
 	const int type = file_option(fd, SOL_SOCKET, SO_TYPE),
 		  domain = file_option(fd, SOL_SOCKET, SO_DOMAIN);
 
 	if (file_option(fd, SOL_SOCKET, SO_ACCEPTCONN) > 0)
-		return end_waiting(fd);
-	if (type != SOCK_STREAM)
-		return drop_messages(fd, type == SOCK_SEQPACKET);
-	if (!inside)
+		return file_turn_away(fd);
+	if (type == SOCK_STREAM && !inside)
 		return end_connection(fd, domain);
-	return has_bytes(fd) && file_drain(fd, false);
+	return file_empty_socket(fd, type == SOCK_STREAM || type == SOCK_SEQPACKET);
 }
 
 static bool drop_from_pipe(int fd)

@@ -233,7 +233,7 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 	const bool together = guard->meeting != NULL;
 	struct avc_config config = guard->config;
 
-	if (is_command(reason) || !policy_repeats(&guard->policy, &config, now_ns()))
+	if (is_command(reason) || !policy_on_probation(&guard->policy, &config, now_ns()))
 		config.again = AVC_AGAIN_SAME;
 	event.ticket = guard->restore_ticket;
 	event.reason = reason;

@@ -34,7 +34,7 @@ static uint64_t lesser(uint64_t a, uint64_t b)
 	return a < b ? a : b;
 }
 
-static bool on_probation(const struct policy *policy, const struct avc_config *config, uint64_t now)
+bool policy_on_probation(const struct policy *policy, const struct avc_config *config, uint64_t now)
 {
 	return policy->restored_ns && now - policy->restored_ns < config->restore_window_ns;
 }
@@ -84,7 +84,7 @@ struct policy_generation policy_new_generation(struct policy *policy,
 {
 	struct policy_generation fresh = { .number = number, .taken_ns = now };
 
-	if (!on_probation(policy, config, now)) {
+	if (!policy_on_probation(policy, config, now)) {
 		policy->restored_ns = 0;
 		policy->lineage = ++policy->lineages;
 	}
@@ -111,7 +111,7 @@ uint32_t policy_replaced(const struct policy *policy, const struct avc_config *c
 {
 	const int vouched = newest_vouched(policy), seen = newest_seen(policy);
 
-	if (on_probation(policy, config, now))
+	if (policy_on_probation(policy, config, now))
 		for (uint32_t i = policy->count; i-- > 0;)
 			if (policy->held[i].lineage == policy->lineage && (int)i != vouched &&
 			    (int)i != seen)
@@ -134,7 +134,7 @@ struct policy_line policy_line(const struct policy *policy, const struct avc_con
 	return (struct policy_line){
 		.held = true,
 		.kept = (int)i == newest_vouched(policy) || (int)i == newest_seen(policy),
-		.suspect = on_probation(policy, config, now) &&
+		.suspect = policy_on_probation(policy, config, now) &&
 			   policy->held[i].lineage == policy->lineage,
 	};
 }
@@ -444,17 +444,13 @@ struct policy_verdict policy_judge(const struct avc_config *config, int status, 
 	return (struct policy_verdict){ false, AVC_REASON_POLICY };
 }
 
-bool policy_repeats(const struct policy *policy, const struct avc_config *config, uint64_t now)
-{
-	return on_probation(policy, config, now);
-}
-
 /* What it came from is suspect.  A hang is detected late, so a hung process is on probation until
  * it was healthy once. */
 static void count_crash(struct policy *policy, const struct avc_config *config, bool hung,
 			uint64_t now)
 {
-	const bool probation = on_probation(policy, config, now) || (hung && !policy->proved);
+	const bool probation = policy_on_probation(policy, config, now) ||
+			       (hung && !policy->proved);
 
 	for (uint32_t i = 0; i < policy->count; i++) {
 		struct policy_generation *held = &policy->held[i];
@@ -495,7 +491,7 @@ static void count_at_once(struct policy *policy, const struct avc_config *config
 	const bool again = policy->at_once_status == what &&
 			   policy->at_once_lineage == policy->lineage;
 
-	if (!on_probation(policy, config, now) || now - policy->restored_ns >= AT_ONCE_NS ||
+	if (!policy_on_probation(policy, config, now) || now - policy->restored_ns >= AT_ONCE_NS ||
 	    !is_its_own(policy, status)) {
 		policy->at_once_status = 0;
 		return;

@@ -184,8 +184,9 @@ struct policy_verdict {
 struct policy_verdict policy_judge(const struct avc_config *config, int status, bool stop_asked,
 				   enum avc_reason asked);
 
-/* Whether the process that died had been restored after a crash not long before. */
-bool policy_repeats(const struct policy *policy, const struct avc_config *config, uint64_t now);
+/* Whether the process (that died) was restored after a crash not long ago. */
+bool policy_on_probation(const struct policy *policy, const struct avc_config *config,
+			 uint64_t now);
 
 /* How many of the oldest are left: after `healthy`, the app may have hung already; those between
  * the two keep crashing.  The newest of `trusted` is to be restored; 0: give up. */

@@ -411,19 +411,19 @@ static void take_back(struct restore *restore)
 	restore->pid = 0;
 }
 
-/* Two threads that have done each other harm, always after the same time, meet at another one.  Those
- * of a process in a sandbox are released by the guard, all at once. */
-static void stagger(const struct restore *restore, const struct image *image)
+/* Each thread goes on so long after `go`, at most: two that have done each other harm, always after the
+ * same time, meet at another one.  Those of a process in a sandbox are released by the guard, all at
+ * once. */
+static void set_pauses(const struct image *image, uint32_t most_ms)
 {
 	const struct parasite *parasite = &image->process->parasite;
-	const bool staggers = restore->config->again & AVC_AGAIN_STAGGER;
-	uint16_t random[THREADS_MAX];
+	uint16_t random[THREADS_MAX] = { 0 };
 
-	if (staggers && getrandom(random, sizeof random, 0) < 0)
-		memset(random, 0, sizeof random);
+	if (most_ms && getrandom(random, sizeof random, 0) < 0)
+		return;
 	for (uint32_t i = 0; i < image->threads && i < parasite->threads_max; i++)
-		parasite_thread(parasite, image->slot, i)->pause_ms =
-			staggers ? random[i % THREADS_MAX] % (STAGGER_MS + 1) : 0;
+		parasite_thread(parasite, image->slot, i)->pause_ms = random[i % THREADS_MAX] %
+								      (most_ms + 1);
 }
 
 /* Until all threads of the process are back; or it has died again already. */
@@ -442,11 +442,12 @@ static void go(struct restore *restore)
 	struct generation *generation = restore->generation;
 	const struct image *main = &generation->image[0];
 	struct inj_slot *slot = parasite_slot(&main->process->parasite, main->slot);
+	const bool staggers = restore->config->again & AVC_AGAIN_STAGGER;
 	const uint64_t end = now_ns() + READY_NS;
 
-	for (uint32_t i = 0; i < generation->images; i++)
+	for (uint32_t i = 0; staggers && i < generation->images; i++)
 		if (generation->image[i].process)
-			stagger(restore, &generation->image[i]);
+			set_pauses(&generation->image[i], STAGGER_MS);
 	if (restore->tree)
 		restore_tree_go(restore->tree);
 	if (!restore->sandbox && main->headless) {
@@ -457,11 +458,14 @@ static void go(struct restore *restore)
 	spare_drop(generation); /* it shares memory with what runs now */
 	await_running(main, restore->pidfd, end);
 	/* The others take no longer, unless they are to. */
-	for (uint32_t i = 1; restore->config->again & AVC_AGAIN_STAGGER && i < generation->images;
-	     i++)
-		if (generation->image[i].process)
-			await_running(&generation->image[i], restore_tree_pidfd(restore->tree, i),
-				      end);
+	for (uint32_t i = 0; staggers && i < generation->images; i++) {
+		const struct image *image = &generation->image[i];
+
+		if (i && image->process)
+			await_running(image, restore_tree_pidfd(restore->tree, i), end);
+		if (image->process)
+			set_pauses(image, 0);
+	}
 	restore->restore_ns = now_ns() - restore->died_ns;
 	for (uint32_t i = 0; i < generation->images; i++)
 		generation->image[i].pid = i ? restore_tree_pid(restore->tree, i) : restore->pid;
