@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from testkit.family import kill_main
-from testkit.guarded import WHERE, GuardProcess, Victim, config, kill_at_random
+from testkit.guarded import WHERE, GuardProcess, Victim, config, kill_at_random, sleep_exactly
 
 
 @pytest.fixture(autouse=True)
@@ -49,5 +49,22 @@ def test_orphans_of_sessions_whose_leaders_are_gone(kind: str, tmp_path: Path) -
             since = guard.mark()
             guard.wait("checkpoint", since=since)
             kill_main(victim)
+            guard.wait("restored", since=since)
+            victim.wait_beats(3)
+
+
+@pytest.mark.shared_machine("a holder that is not made in time after a restore is made by the next checkpoint")
+def test_killed_again_before_the_next_checkpoint(tmp_path: Path) -> None:
+    """The first time during a checkpoint, in which nobody can be asked any more; the terminal is a child's alone."""
+    with Victim("places terminal --in-child", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        guard.checkpoint()
+        for turn in range(30):
+            since = guard.mark()
+            guard.say_command("checkpoint")
+            sleep_exactly(turn % 10 * 1e-4)
+            victim.kill_app()
+            guard.wait("restored", since=since)
+            since = guard.mark()
+            victim.kill_app()
             guard.wait("restored", since=since)
             victim.wait_beats(3)

@@ -117,6 +117,7 @@ static int make_images(const struct tree *tree, struct generation *generation,
 		*image = (struct image){
 			.process = entry->process,
 			.shared = entry->process ? entry->process->shared : 0,
+			.adopts = entry->process && entry->process->adopts,
 			.parent = entry->parent == PARENT_INIT ? PARENT_INIT : index[entry->parent],
 			.pidfd = -1,
 			.slot = slot,

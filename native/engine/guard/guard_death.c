@@ -93,6 +93,8 @@ static void adopt_family(struct avc_guard *guard, const struct generation *gener
 		if (process->infected)
 			process->start = stat.start;
 		process->shared = image->shared;
+		/* The last checkpoint may have asked one that was dying, and got no answer. */
+		process->adopts = image->adopts;
 	}
 	tree->count = 0;
 	guard->main.childless = generation->images == 1;

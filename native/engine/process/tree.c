@@ -404,8 +404,7 @@ int tree_scan(struct tree *tree, struct avc_error *err)
 	return 0;
 }
 
-/* One that could not be queried is exiting, which is not known yet: the result also applies to the
- * one that is restored in its place (guard_death.c, hold_all()). */
+/* One that could not be queried is exiting, which is not known yet. */
 static bool may_be_reaper(struct process *process)
 {
 	const struct thread *thread = process ? thread_find(process, process->pid) : NULL;

@@ -50,6 +50,7 @@ struct image {
 	struct seal *seal; /* of each of its threads                          */
 	uint32_t seals;
 	uint64_t shared_filters; /* a hash of those that all of its threads have          */
+	bool adopts;             /* struct process; then                              */
 	bool headless;           /* its main thread had ended                       */
 	int stop_signal;         /* stopped by that (job control), 0: it was not     */
 	int64_t dumpable;        /* prctl(2), PR_GET_DUMPABLE                        */
