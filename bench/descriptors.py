@@ -17,6 +17,7 @@ import resource
 import signal
 import socket
 import statistics
+import struct
 import tempfile
 import time
 from collections.abc import Callable
@@ -27,11 +28,22 @@ from bench.subjects import build
 from testkit.guarded import GuardProcess, Victim, config
 from testkit.harness import wait_until
 
+
+def connect_to_self() -> tuple[int, int]:
+    """Both ends of a TCP connection, which is reset when it is closed, so that its port is free again."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        one = socket.create_connection(listener.getsockname())
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        return one.detach(), listener.accept()[0].detach()
+
+
 KINDS: dict[str, Callable[[], tuple[int, ...]]] = {
     "null": lambda: (os.open("/dev/null", os.O_RDONLY),),
     "file": lambda: (os.open("/etc/passwd", os.O_RDONLY),),
     "eventfd": lambda: (os.eventfd(0),),
     "pair": lambda: tuple(end.detach() for end in socket.socketpair()),
+    "pipe": os.pipe,
+    "peers": connect_to_self,
     "tcp": lambda: (socket.socket(socket.AF_INET, socket.SOCK_STREAM).detach(),),
 }
 

@@ -5,12 +5,14 @@
  */
 #include "parasite.h"
 
+#include <asm/stat.h>
 #include <asm/unistd.h>
 #include <linux/futex.h>
 #include <linux/mman.h>
 #include <linux/prctl.h>
 #include <linux/sched.h>
 #include <stdbool.h>
+#include <stddef.h>
 
 #include "syscall.h"
 
@@ -142,6 +144,86 @@ static long change_caps(uint64_t option, uint64_t set)
 	return 0;
 }
 
+#define ENOTSOCK_ 88
+#define EBADF_ 9
+#define IPPROTO_TCP_ 6
+#define TCP_INFO_ 11 /* its first byte is the state */
+#define TCP_CLOSE_ 7
+#define TCP_LISTEN_ 10
+#define AF_UNIX_ 1
+#define AF_INET_ 2
+#define AF_INET6_ 10
+#define S_IFMT_ 0170000
+#define S_IFIFO_ 0010000
+#define NO_NAME 2 /* bytes of a Unix socket's address without one */
+
+struct inj_name {
+	uint16_t family, port; /* port: not of a Unix socket */
+	uint8_t rest[124];
+	uint32_t bytes;
+};
+
+static bool ask_name(long nr, uint64_t fd, struct inj_name *name)
+{
+	name->bytes = offsetof(struct inj_name, bytes);
+	return SYS3(nr, fd, name, &name->bytes) == 0;
+}
+
+static bool has_no_name(uint64_t fd)
+{
+	struct inj_name name;
+
+	if (!ask_name(__NR_getsockname, fd, &name))
+		return false;
+	return name.family == AF_UNIX_
+		       ? name.bytes <= NO_NAME
+		       : (name.family == AF_INET_ || name.family == AF_INET6_) && name.port == 0;
+}
+
+/* An accepted one shows the name of the socket that accepted it; clients have none. */
+static bool was_accepted(uint64_t fd)
+{
+	struct inj_name peer;
+
+	return ask_name(__NR_getpeername, fd, &peer) && peer.family == AF_UNIX_ &&
+	       peer.bytes <= NO_NAME;
+}
+
+/* A port, a name, a lock, a device: what others could miss while it is open, or have for themselves.  A
+ * TCP connection keeps the port of its listening socket, or one that the kernel chose.  *nameless:
+ * what the one before was, and this may be. */
+static bool claims(uint64_t fd, bool *nameless)
+{
+	struct stat stat;
+	uint8_t state = 0;
+	uint32_t bytes = sizeof state;
+	long r;
+
+	if (*nameless && has_no_name(fd))
+		return false;
+	*nameless = false;
+	r = raw_syscall(__NR_getsockopt, fd, IPPROTO_TCP_, TCP_INFO_, (uint64_t)&state,
+			(uint64_t)&bytes, 0);
+	if (r == -EBADF_)
+		return false;
+	if (r == -ENOTSOCK_)
+		return SYS2(__NR_fstat, fd, &stat) || (stat.st_mode & S_IFMT_) != S_IFIFO_;
+	if (r == 0 && state != TCP_CLOSE_ && state != TCP_LISTEN_)
+		return false;
+	*nameless = has_no_name(fd);
+	return !*nameless && !was_accepted(fd);
+}
+
+static void close_claims(uint64_t fd, uint64_t count)
+{
+	bool nameless = false;
+
+	for (uint64_t end = fd + count; fd < end; fd++)
+		if (claims(fd, &nameless))
+			SYS1(__NR_close, fd);
+	SYS3(__NR_close_range, fd, (uint32_t)-1, 0);
+}
+
 /* A tracer can interrupt it: not ours, but the next one when ours has died.  So it sleeps as park()
  * does.  Without a tracer its filters may refuse that call, with any error.  False: no tracer has
  * ended it. */
@@ -177,6 +259,8 @@ __attribute__((section(".text.entry"))) void inj_run(uint64_t result, struct inj
 			alone = !make_pause(call);
 		else if (s->nr == INJ_FUTURE_LOCK)
 			s->result = find_future_lock();
+		else if (s->nr == INJ_CLOSE_CLAIMS)
+			close_claims(s->arg[0], s->arg[1]);
 		else if (s->nr == INJ_CAPS)
 			s->result = find_caps(s->arg[0], (const uint32_t *)s->arg[1]);
 		else if (s->nr == __NR_clone)

@@ -37,7 +37,7 @@ static void check(const struct avc_event *event)
 {
 	must(event->cookie == COOKIE, "a guard speaks of its own container");
 	must(event->kind >= AVC_EVENT_ATTACHED && event->kind <= AVC_EVENT_WAITS, "its kind");
-	must(event->reason >= AVC_REASON_NONE && event->reason <= AVC_REASON_GROUP, "its reason");
+	must(event->reason >= AVC_REASON_NONE && event->reason <= AVC_REASON_FILTER, "its reason");
 	must(memchr(event->error.detail, 0, sizeof event->error.detail) != NULL, "a clause ends");
 }
 

@@ -11,6 +11,7 @@
  *   files_capture.c when a checkpoint reads what
  *   files_info.c    what /proc/PID/fdinfo says
  *   files_input.c   unread input, to be dropped
+ *   files_late.c    connections that are closed when the application runs again
  *   files_state.c   what is behind a descriptor: offsets, counts, timers, bytes, locks
  *   files_messages.c contents of Unix sockets, and which ends are shut down
  *   files_options.c options of sockets, and whether one can be recreated
@@ -85,6 +86,11 @@ void files_free(struct files *files);
  * was dropped (config->again); -1 is for fatal errors. */
 int files_restore(struct image *image, uint32_t images, const struct avc_config *config, pid_t init,
 		  struct avc_error *notes, struct avc_error *err) warn_unused;
+/* files_late.c: after files_restore(), the holder of the main process may be busy: it closes what the
+ * restored process must not find open any more.  Before that runs, waits for it; what is left are
+ * connections, which files_drop_late() has it close without waiting, unless it is killed anyway. */
+void files_await_late(const struct process *process);
+void files_drop_late(const struct process *process);
 /* A process that is being restored opens its pidfds itself: raises its descriptor limit for that,
  * until it sets the limit again. */
 void files_lift_limit(const struct files *want, pid_t pid);
@@ -601,6 +607,9 @@ int files_borrow_placed(const struct files_work *work, const struct file *w);
 /* Makes the listed calls. */
 int files_work_flush(struct files_work *work, struct avc_error *err) warn_unused;
 void files_note(struct files_work *work, const struct file *f, const char *problem);
+
+/* Before the listed calls close what is new: leaves thousands of connections to the holder. */
+void files_take_late(const struct files_work *work);
 
 uint32_t files_index(const struct files *files, const struct file *file);
 /* Index of the first descriptor of the same open file description. */

@@ -905,6 +905,7 @@ int files_work_gather(struct files_work *work, struct avc_error *err)
 		return -1;
 	if (work->process->descendant)
 		return gather_anew(work, err);
+	files_take_late(work);
 	/* What is left on the list is made just before the fork (restore.c). */
 	return set_cloexec(work, err) || (is_urgent(work) && files_work_flush(work, err)) ? -1 : 0;
 }

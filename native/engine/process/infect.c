@@ -943,6 +943,7 @@ static void forget_holder(struct process *process)
 	process->doubtful = false;
 	process->holder = 0;
 	process->holder_inside = 0;
+	process->late = false;
 	process->holder_pidfd = -1;
 }
 

@@ -264,6 +264,7 @@ struct process {
 	bool blind;                   /* it may not even look at its holder                 */
 	bool renewed;                 /* its holder was, for the threads' sake (fence.c)    */
 	bool undumpable;              /* prctl(2), PR_GET_DUMPABLE, when it was last asked  */
+	bool late;                    /* its holder closes descriptors late (files_late.c)   */
 	bool adopts;                  /* it or an ancestor adopts orphans, or may do so     */
 	bool paused; /* between process_pause_adoption() and process_resume_adoption()         */
 	struct tracker *tracker; /* process/tracker.c; NULL: its memory is not watched         */

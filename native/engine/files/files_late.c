@@ -1,0 +1,170 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Closing late.  A server that dies may have thousands of connections that it has not had at the
+ * checkpoint.  All have to be closed, and the kernel takes 4 to 10 us for each.  So the holder of
+ * the main process, which dies anyway when that runs again, takes them along: it gets a table of
+ * its own before they are closed in the application's, and there closes at once what claims
+ * something that the restored process, or others, may want: ports, names, locks, devices
+ * (INJ_CLOSE_CLAIMS).  To look takes a microsecond.  Peers of the rest are told some milliseconds
+ * later that it is closed.
+ *
+ * The holder never closes anything in the application's table: if it gets no CPU for long, that is
+ * in use again by then.
+ */
+#include <fcntl.h>
+#include <sched.h>
+#include <signal.h>
+#include <stdio.h>
+#include <string.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "files.h"
+
+/* With fewer it takes longer to ask the holder. */
+#define LATE_LEAST 1000
+#define LATE_MAX (1 << 20)
+/* So many times as many numbers as there are descriptors are looked at. */
+#define SPARSE 2
+#define SAMPLES 16
+#define ENDS_NS NS_PER_S
+
+/* How many it has; 0 before Linux 6.2, which does not tell. */
+static int64_t size_of_table(pid_t pid)
+{
+	const int dir = proc_open(pid, "fd", O_RDONLY | O_DIRECTORY);
+	struct stat st = { 0 };
+	const int result = dir < 0 ? -1 : fstat(dir, &st);
+
+	if (dir >= 0)
+		close(dir);
+	return result ? 0 : st.st_size;
+}
+
+/* A socket that has to be made anew may need a port that a connection keeps. */
+static bool makes_socket(const struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+
+		if (w->kind == FILE_SOCKET && work->lost[i] &&
+		    work->local[files_leader(work->want, w)] < 0)
+			return true;
+	}
+	return false;
+}
+
+/* What goes on is the application's alone, from now on. */
+static bool close_kept(const struct files_work *work, struct inj_call *call)
+{
+	const struct files *now = work->now;
+	uint32_t next;
+
+	for (uint32_t i = 0; i < now->count; i = next) {
+		next = i + 1;
+		if (work->closed[i])
+			continue;
+		while (next < now->count && !work->closed[next] &&
+		       now->file[next].fd == now->file[next - 1].fd + 1)
+			next++;
+		if (call->count == INJ_CALLS_MAX - 1)
+			return false;
+		call_add(call, SYS_close_range, (uint64_t)now->file[i].fd,
+			 (uint64_t)now->file[next - 1].fd);
+	}
+	return true;
+}
+
+/* Sockets and pipes take the time; to look at all the others is in vain. */
+static bool are_mostly_sockets(pid_t pid, int64_t open)
+{
+	const int dir = proc_open(pid, "fd", O_RDONLY | O_DIRECTORY);
+	int found = 0;
+
+	for (int i = 0; dir >= 0 && i < SAMPLES; i++) {
+		char number[16], link[16] = "";
+
+		snprintf(number, sizeof number, "%d", (int)(open * (i + 1) / (SAMPLES + 1)));
+		(void)!readlinkat(dir, number, link, sizeof link - 1);
+		found += !strncmp(link, "socket:", 7) || !strncmp(link, "pipe:", 5);
+	}
+	if (dir >= 0)
+		close(dir);
+	return found > SAMPLES / 2;
+}
+
+/* Has the holder begin with its calls. */
+static int start(const struct process *process)
+{
+	struct avc_error ignored = { 0 };
+	struct arch_regs base;
+
+	return arch_regs_get(process->holder, &base) ||
+			       parasite_send(&process->parasite, process->holder, &base,
+					     &process->parasite.control->holder, &ignored) ||
+			       parasite_start(process->holder, &ignored)
+		       ? -1
+		       : 0;
+}
+
+static int finish(const struct process *process)
+{
+	struct avc_error ignored = { 0 };
+
+	return parasite_finish(process->holder, &process->parasite.control->holder, &ignored);
+}
+
+/* Whatever it still has is closed with it. */
+static void end(const struct process *process)
+{
+	struct pollfd ends = { .fd = process->holder_pidfd, .events = POLLIN };
+
+	syscall(SYS_pidfd_send_signal, process->holder_pidfd, SIGKILL, NULL, 0);
+	(void)poll_for(&ends, 1, ENDS_NS);
+}
+
+void files_take_late(const struct files_work *work)
+{
+	struct process *process = work->process;
+	struct inj_call *call = &process->parasite.control->holder;
+	const int64_t open = work->table ? size_of_table(work->table) : 0;
+
+	if (open < LATE_LEAST + (int64_t)work->now->count || open > LATE_MAX || !process->holder ||
+	    process->parasite.seccomp == SECCOMP_SUPERVISED || makes_socket(work) ||
+	    !are_mostly_sockets(work->table, open))
+		return;
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, SYS_unshare, CLONE_FILES);
+	if (start(process) || finish(process)) {
+		end(process);
+		return;
+	}
+	if (call->call[0].result)
+		return;
+	call_begin(call, INJ_AFTER_PARK);
+	if (close_kept(work, call)) {
+		call_add(call, INJ_CLOSE_CLAIMS, 0, (uint64_t)(SPARSE * open));
+		process->late = start(process) == 0;
+	}
+	if (!process->late)
+		end(process);
+}
+
+void files_await_late(const struct process *process)
+{
+	if (process->late && finish(process))
+		end(process);
+}
+
+void files_drop_late(const struct process *process)
+{
+	struct inj_call *call = &process->parasite.control->holder;
+
+	if (!process->late)
+		return;
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, SYS_close_range, 0, ~0u);
+	if (start(process))
+		return; /* it was killed, and has nothing open any more */
+}
