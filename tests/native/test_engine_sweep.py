@@ -100,7 +100,7 @@ def answer(guard: GuardProcess, death: Death, nth: int, command: str) -> dict[st
 BARREN = "under barren steady"
 """Its filter refuses what injected code calls without its guard."""
 VICTIMS = ("steady", "steady --in-child", "peeker", "peeker --in-child", "signals 3", BARREN, CELLS)
-RESTORED = ("steady", "steady --in-child", *([CELLS] if SWEEP == "all" else []))  # it takes an hour
+RESTORED = ("steady", "steady --in-child", CELLS)
 REFUSED = ("under no-sigprocmask idle 1 1", "sandbox --kill", "unsupported strict")
 """Under filters by which a dead guard could do harm."""
 UNSEEN = 8
@@ -226,7 +226,7 @@ def test_restore(tmp_path: Path, command: str, way: str, death: Death) -> None:
     if images is Images.DIRTY and any(tree in command for tree in TREES):
         pytest.skip("trees are forked")
     with Victim(command, tmp_path) as first, GuardProcess(config(images=images), [first.pid]) as guard:
-        for nth in numbers(32):
+        for nth in numbers(256 if command == CELLS else 32):
             with Victim(command, tmp_path) as victim:
                 guard.start_another(victim.pid)
                 for _ in range(before):
