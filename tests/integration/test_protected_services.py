@@ -12,11 +12,14 @@ import time
 
 import pytest
 
-from testkit.harness import Container, ContainerFactory, Sidecar, wait_until
+from testkit.harness import Container, ContainerFactory, Sidecar, take_checkpoint, wait_until
 
 pytestmark = pytest.mark.shared_machine(
     "init waits two seconds for its guard, which may get no CPU for as long; clients have time limits of their own"
 )
+
+LATER = 2000
+"""More than LATE_LEAST of files_late.c."""
 
 ASYNCIO_SERVER = """
 import asyncio, os, threading
@@ -124,6 +127,28 @@ def test_an_asyncio_server_keeps_its_connection(sidecar: Sidecar, container: Con
     assert seen.count(0) == 1
     assert all(after > earlier - 20 for earlier, after in zip(seen, seen[1:]))
     wait_until(lambda: max(ticks(made)) > max(seen) + 5, 5, "the log goes on")
+
+
+def test_thousands_of_later_connections_end(sidecar: Sidecar, container: ContainerFactory) -> None:
+    """Those that it had at the checkpoint go on; the restored server takes new ones at once."""
+    made = container.protected("python3", "-c", ASYNCIO_SERVER, labels={"interval": "1h"}, options=["--network=host"])
+    kept = Peer("127.0.0.1", 7000)
+    assert kept.ask("hello").split()[1:] == [b"1", b"hello"]
+    take_checkpoint(sidecar.client, made.name)
+    with contextlib.ExitStack() as later:
+        peers = [Peer("127.0.0.1", 7000) for _ in range(LATER)]
+        for peer in peers:
+            later.enter_context(peer.socket)
+            assert peer.ask("hello").split()[1:] == [b"1", b"hello"]
+        os.kill(sidecar.app_pid(made), signal.SIGKILL)
+        entry = sidecar.wait_restores(made, 1)
+        assert entry["state"] == "protected"
+        assert kept.ask("again").split()[1:] == [b"2", b"again"]
+        assert Peer("127.0.0.1", 7000).ask("hello").split()[1:] == [b"1", b"hello"]
+        for peer in peers:
+            peer.socket.settimeout(15)
+            with contextlib.suppress(ConnectionResetError):
+                assert peer.socket.recv(1) == b""
 
 
 def test_redis_keeps_its_client_and_its_data(sidecar: Sidecar, container: ContainerFactory) -> None:

@@ -12,7 +12,7 @@
  * in use again by then.
  */
 #include <fcntl.h>
-#include <sched.h>
+#include <linux/close_range.h>
 #include <signal.h>
 #include <stdio.h>
 #include <string.h>
@@ -94,6 +94,15 @@ static bool are_mostly_sockets(pid_t pid, int64_t open)
 	return found > SAMPLES / 2;
 }
 
+/* Its own filters were asked for less. */
+static bool may_ask(const struct process *process)
+{
+	struct proc_status status;
+
+	return proc_status(process->holder, &status) == 0 &&
+	       seccomp_is_containers(&status, process->plain_filters) && !seccomp_refuses_asking();
+}
+
 /* Has the holder begin with its calls. */
 static int start(const struct process *process)
 {
@@ -131,11 +140,11 @@ void files_take_late(const struct files_work *work)
 	const int64_t open = work->table ? size_of_table(work->table) : 0;
 
 	if (open < LATE_LEAST + (int64_t)work->now->count || open > LATE_MAX || !process->holder ||
-	    process->parasite.seccomp == SECCOMP_SUPERVISED || makes_socket(work) ||
-	    !are_mostly_sockets(work->table, open))
+	    makes_socket(work) || !are_mostly_sockets(work->table, open) || !may_ask(process))
 		return;
 	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, SYS_unshare, CLONE_FILES);
+	/* Filters that forbid unshare(2) allow this. */
+	call_add(call, SYS_close_range, ~0u, ~0u, CLOSE_RANGE_UNSHARE);
 	if (start(process) || finish(process)) {
 		end(process);
 		return;

@@ -198,6 +198,13 @@ static const struct kind needed[] = {
 	{ SYS_exit, ANY },
 };
 static const struct kind needed_to_watch = { SYS_userfaultfd, ANY };
+/* INJ_CLOSE_CLAIMS */
+static const struct kind needed_to_ask[] = {
+	{ SYS_getsockopt, ANY },
+	{ SYS_getsockname, ANY },
+	{ SYS_getpeername, ANY },
+	{ SYS_fstat, ANY },
+};
 
 /* What must not be refused when the guard has died in the middle: the thread's signals would stay
  * blocked, its memory would stay as it is for a clone, a porter would call exit(2) for ever.  And
@@ -422,12 +429,13 @@ static bool bars_restart(const struct program *p)
 
 /* The container's filters, as of the first thread that was looked at. */
 static struct {
-	bool known, hinder, refuse_watching, bar_restart;
+	bool known, hinder, refuse_watching, refuse_asking, bar_restart;
 } containers_filters;
 
 static void note_containers(const struct program *p, bool barred)
 {
 	containers_filters.hinder |= refuses_any(p, needed, COUNT(needed)) || barred;
+	containers_filters.refuse_asking |= refuses_any(p, needed_to_ask, COUNT(needed_to_ask));
 	containers_filters.bar_restart |= bars_restart(p);
 	containers_filters.refuse_watching |= verdict(p, needed_to_watch.nr, needed_to_watch.arg) !=
 					      PASSES;
@@ -450,6 +458,11 @@ bool seccomp_can_be_confined(void)
 bool seccomp_refuses_watching(void)
 {
 	return containers_filters.refuse_watching;
+}
+
+bool seccomp_refuses_asking(void)
+{
+	return containers_filters.refuse_asking;
 }
 
 void seccomp_confined(void)

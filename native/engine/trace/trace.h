@@ -430,6 +430,8 @@ int seccomp_read(const struct process *process, struct thread *thread,
 bool seccomp_can_be_confined(void);
 /* Whether the container's filters refuse a userfaultfd. */
 bool seccomp_refuses_watching(void);
+/* ... or what it takes to find out what a socket is (INJ_CLOSE_CLAIMS). */
+bool seccomp_refuses_asking(void);
 /* It has come under one. */
 void seccomp_confined(void);
 bool seccomp_is_confined(void);
