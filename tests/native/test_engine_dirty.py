@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import platform
 import random
 import re
 import select
@@ -17,7 +18,17 @@ import pytest
 from avckpt.guard import Images
 
 from testkit.family import ours
-from testkit.guarded import PATIENCE_S, GuardProcess, Json, Victim, config, kill_at_random, since_linux, sleep_exactly
+from testkit.guarded import (
+    PATIENCE_S,
+    GuardProcess,
+    Json,
+    Victim,
+    config,
+    injected,
+    kill_at_random,
+    since_linux,
+    sleep_exactly,
+)
 from testkit.harness import wait_until
 from testkit.procfs import children_of, figures
 
@@ -301,6 +312,33 @@ def test_templates_are_killed_while_one_gives_its_memory_away(tmp_path: Path) ->
             guard.wait("restored", since=since)
             victim.wait_beats(5)
         assert killed > 20
+
+
+LSEEK = 8 if platform.machine() == "x86_64" else 62
+
+
+def test_one_that_gives_its_memory_away_is_killed_before_it_has(tmp_path: Path) -> None:
+    """Another one has its place already, and not the last pages yet: nobody may be restored from that."""
+    with Victim("dirt 60 2 --rate 20000", tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
+        call, rounds = Path(f"/proc/{guard.pid}/syscall"), 0
+        while rounds < 12:
+            until_near(guard)
+            victim.wait_beats(60)
+            if checkpoint(guard)["images"] != "dirty":
+                continue
+            os.kill(guard.pid, signal.SIGSTOP)  # it would bring the one before up to date
+            template = os.pidfd_open(newest_template(guard, victim))
+            since = guard.mark()
+            victim.kill_app()
+            # It asks for positions of files when it has found who takes the place.
+            with injected(guard, "lseek", "delay_enter=100000"):
+                os.kill(guard.pid, signal.SIGCONT)
+                wait_until(lambda: call.read_text().startswith(f"{LSEEK} "), PATIENCE_S, "it asks", 0.001)
+                signal.pidfd_send_signal(template, signal.SIGKILL)
+                guard.wait("restored", since=since)
+            os.close(template)
+            victim.wait_beats(20)
+            rounds += 1
 
 
 def test_each_process_of_a_tree_is_copied_by_itself(tmp_path: Path) -> None:

@@ -4,10 +4,10 @@
  * time, and read again.
  *
  * Each thread has a part of MB, and a table that says what stands in each page of it; a page that
- * holds anything else is a violation.  It writes pages, gives some back (MADV_DONTNEED) and protects
- * some for a while.  With --maps it also unmaps and maps again, moves mappings, grows and shrinks
- * the heap, has mappings that come and go or stay, guard pages, and deep stacks.  KB_PER_S (0: as fast as it
- * can) of all threads together.
+ * holds anything else is a violation, and so is memory of another moment than the registers.  It
+ * writes pages, gives some back (MADV_DONTNEED) and protects some for a while.  With --maps it also
+ * unmaps and maps again, moves mappings, grows and shrinks the heap, has mappings that come and go or
+ * stay, guard pages, and deep stacks.  KB_PER_S (0: as fast as it can) of all threads together.
  */
 #include <pthread.h>
 #include <sys/mman.h>
@@ -45,7 +45,7 @@ struct part {
 	int index;
 	struct block block[BLOCKS];
 	uint64_t *heap_at, heap_stamp; /* of the first part: what the heap has grown by     */
-	uint64_t random, stamps;
+	uint64_t random, stamps, laps;
 	char *memory;
 	uint64_t *expected; /* by page; 0: nothing was written                 */
 };
@@ -323,17 +323,26 @@ static void step(struct part *part)
 	check_page(part, next_random(&part->random) % part_pages);
 }
 
+/* The value is in a register meanwhile, and nowhere else. */
+static __attribute__((noinline)) uint64_t nap_with(uint64_t value)
+{
+	nap_us(NAP_US);
+	__asm__ volatile("" : "+r"(value));
+	return value;
+}
+
 static void *work(void *arg)
 {
 	struct part *part = arg;
 	const uint64_t start = now_ns();
-	uint64_t steps = 0;
+	uint64_t steps = 0, laps = 0;
 
-	for (;;) {
+	for (;; laps++) {
 		const uint64_t elapsed_us = (now_ns() - start) / 1000;
 		const uint64_t due = rate ? elapsed_us * rate / (uint64_t)threads / 4 / 1000000
 					  : steps + 256;
 
+		CHECK(part->laps++ == laps, "lap %lu, in memory %lu", laps, part->laps - 1);
 		/* After a restore much is due. */
 		if (due > steps + 4096)
 			steps = due - 4096;
@@ -342,7 +351,7 @@ static void *work(void *arg)
 		if (!part->index)
 			beat();
 		if (rate)
-			nap_us(NAP_US);
+			laps = nap_with(laps);
 	}
 	return NULL;
 }

@@ -26,6 +26,7 @@ struct spare {
 	struct arch_regs base;
 	bool tried;    /* one was begun                                          */
 	bool unwanted; /* one was a process too many for a restore               */
+	bool alone;    /* the template has not got its memory yet (stand_in.c)   */
 	/* What the template is still doing for it. */
 	enum { SPARE_NO_WORK, SPARE_FORK, SPARE_REST } work;
 	struct scheduling scheduling; /* the template's own                        */

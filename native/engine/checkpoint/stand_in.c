@@ -88,6 +88,7 @@ static void exchange(struct dirty *dirty, struct generation *generation)
 	generation->spare.pid = image->template;
 	generation->spare.pidfd = image->pidfd;
 	generation->spare.base = image->base;
+	generation->spare.alone = true;
 	image->template = idle->pid;
 	image->pidfd = idle->pidfd;
 	image->base = idle->base;
@@ -103,6 +104,7 @@ static void settle(struct dirty *dirty, struct generation *generation)
 	struct image *image = &generation->image[0];
 
 	dirty->standing_in = false;
+	generation->spare.alone = false;
 	free(image->inherited);
 	image->inherited = dirty->idle.inherited;
 	dirty->idle.inherited = NULL;

@@ -109,6 +109,16 @@ static int send_off(const struct image *image, pid_t child, struct sandbox **san
 	return 0;
 }
 
+/* Where a spare has died, the template has the same memory; but not one that stands in for it, and gets
+ * the last pages only afterwards. */
+static int check_memory(struct generation *generation, struct avc_error *err)
+{
+	return spare_is_there(generation) || !generation->spare.alone
+		       ? 0
+		       : fail(err, AVC_GONE, 0, generation->image[0].inside, "restore", "",
+			      "the template that gives it its memory was killed");
+}
+
 /* One fork of the template, or the process that takes over its spare's memory.  If it is to have
  * children, it stays stopped. */
 static int fork_template(struct restore *restore, bool again, struct avc_error *err)
@@ -123,6 +133,8 @@ static int fork_template(struct restore *restore, bool again, struct avc_error *
 	const struct arch_regs *base = spare ? &generation->spare.base : &image->base;
 	pid_t child = 0;
 
+	if (check_memory(generation, err))
+		return -1;
 	/* The first time there are calls of files_restore() before it. */
 	if (again)
 		call_begin(call, INJ_AFTER_PARK);
@@ -346,7 +358,7 @@ static int make_spare_first(struct restore *restore, struct avc_error *err)
 {
 	struct generation *generation = restore->generation;
 	const uint64_t start = now_ns();
-	int result = spare_await(generation, err);
+	int result = spare_await(generation, err) || check_memory(generation, err) ? -1 : 0;
 
 	if (!result && generation->image[0].anon_pages >= COPIED_PAGES &&
 	    !generation->spare.unwanted && !spare_is_there(generation))
