@@ -175,6 +175,9 @@ static bool event_is_sound(const struct avc_guard *guard, const struct avc_event
 	return event->cookie == guard->cookie && event->kind >= AVC_EVENT_ATTACHED &&
 	       event->kind <= AVC_EVENT_WAITS && event->kind != AVC_EVENT_GUARD_LOST &&
 	       event->reason >= AVC_REASON_NONE && event->reason <= AVC_REASON_UNSHARED &&
+	       (event->images == AVC_IMAGES_FORK || event->images == AVC_IMAGES_DIRTY) &&
+	       event->fork_reason >= AVC_FORK_NONE && event->fork_reason <= AVC_FORK_BUDGET &&
+	       event->again <= (AVC_AGAIN_DROP_INPUT | AVC_AGAIN_STAGGER) &&
 	       event->error.code >= AVC_OK && event->error.code <= AVC_RETRY &&
 	       is_text(event->error.operation, sizeof event->error.operation) &&
 	       is_text(event->error.syscall, sizeof event->error.syscall) &&

@@ -38,6 +38,10 @@ static void check(const struct avc_event *event)
 	must(event->cookie == COOKIE, "a guard speaks of its own container");
 	must(event->kind >= AVC_EVENT_ATTACHED && event->kind <= AVC_EVENT_WAITS, "its kind");
 	must(event->reason >= AVC_REASON_NONE && event->reason <= AVC_REASON_FILTER, "its reason");
+	must(event->images >= AVC_IMAGES_FORK && event->images <= AVC_IMAGES_DIRTY, "its images");
+	must(event->fork_reason >= AVC_FORK_NONE && event->fork_reason <= AVC_FORK_BUDGET,
+	     "why it was forked");
+	must(event->again <= (AVC_AGAIN_DROP_INPUT | AVC_AGAIN_STAGGER), "what was changed");
 	must(memchr(event->error.detail, 0, sizeof event->error.detail) != NULL, "a clause ends");
 }
 

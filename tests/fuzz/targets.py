@@ -252,8 +252,11 @@ def guard_event(data: bytes) -> None:
     """What a guard says of its container, as far as the engine lets it through (native/guard/client.c)."""
     said = ffi.new("struct avc_event *")
     ffi.buffer(said)[: len(data)] = data[: ffi.sizeof("struct avc_event")]
-    said.kind = 1 + said.kind % 11
-    said.reason = abs(said.reason) % 15
+    said.kind = 1 + said.kind % 13
+    said.reason = abs(said.reason) % 19
+    said.images = abs(said.images) % 2
+    said.fork_reason = abs(said.fork_reason) % 16
+    said.again %= 4
     for text in (said.error.detail, said.error.operation, said.error.syscall):
         text[len(text) - 1] = b"\0"
     event = _event(said)
