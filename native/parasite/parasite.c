@@ -190,8 +190,8 @@ static bool was_accepted(uint64_t fd)
 }
 
 /* A port, a name, a lock, a device: what others could miss while it is open, or have for themselves.  A
- * TCP connection keeps the port of its listening socket, or one that the kernel chose.  *nameless:
- * what the one before was, and this may be. */
+ * TCP connection keeps the port of its listening socket, or most often one that the kernel chose.
+ * *nameless: what the one before was, and this may be. */
 static bool claims(uint64_t fd, bool *nameless)
 {
 	struct stat stat;
