@@ -38,7 +38,7 @@ def test_nor_does_it_notice_who_looks_for_what_dead_guards_have_left(where: str,
     """Its stacks are searched for that: memory above them that was never touched is not read, which would show."""
     with Victim(f"mirror {where}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for _ in range(3):
-            said = guard.burst(5)
-            assert said["taken"] > 2, said["reasons"]
+            for _ in range(3):
+                assert guard.checkpoint()["kind"] == "checkpoint"
             victim.wait_beats(3)
             guard.start_another(victim.pid)
