@@ -371,18 +371,6 @@ void generation_close_files(const struct image *image, bool shared)
 		return; /* it was killed, and has nothing open any more */
 }
 
-static bool start_closing(struct process *process)
-{
-	struct inj_call *call = &process->parasite.control->holder;
-	struct avc_error gone = { 0 };
-
-	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, SYS_close_range, 0, ~0u);
-	return parasite_send(&process->parasite, process->holder, &process->holder_base, call,
-			     &gone) == 0 &&
-	       parasite_start(process->holder, &gone) == 0;
-}
-
 void generation_close_tables(const struct generation *generation)
 {
 	bool closing[PROCESSES_MAX] = { false };
@@ -395,7 +383,7 @@ void generation_close_tables(const struct generation *generation)
 		/* The main process has its old one again; others have left theirs. */
 		closing[i] = process && process->holder &&
 			     (owner == i || (owner && !generation->image[owner].process->holder)) &&
-			     start_closing(process);
+			     files_start_closing(process);
 	}
 	for (uint32_t i = 1; i < generation->images; i++) {
 		struct process *process = generation->image[i].process;

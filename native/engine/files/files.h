@@ -86,11 +86,13 @@ void files_free(struct files *files);
  * was dropped (config->again); -1 is for fatal errors. */
 int files_restore(struct image *image, uint32_t images, const struct avc_config *config, pid_t init,
 		  struct avc_error *notes, struct avc_error *err) warn_unused;
-/* files_late.c: after files_restore(), the holder of the main process may be busy: it closes what the
- * restored process must not find open any more.  Before that runs, waits for it; what is left are
- * connections, which files_drop_late() has it close without waiting, unless it is killed anyway. */
+/* files_late.c: after files_restore(), the holder of the main process may be busy (process->late): it
+ * closes what the restored process must not find open any more.  Before that runs, waits for it; what is
+ * left are connections. */
 void files_await_late(const struct process *process);
-void files_drop_late(const struct process *process);
+/* Has the holder close all that its table has, and does not wait; it must have one that the application
+ * does not use.  False: it was killed, and has nothing open any more. */
+bool files_start_closing(const struct process *process);
 /* A process that is being restored opens its pidfds itself: raises its descriptor limit for that,
  * until it sets the limit again. */
 void files_lift_limit(const struct files *want, pid_t pid);
@@ -339,6 +341,7 @@ struct files {
 	int *varied;
 	uint32_t varied_count;
 	bool varied_known;
+	int64_t open;           /* at a restore: how many the table has; 0: unknown     */
 	bool served;            /* some file system may be a file server's                 */
 	bool several;           /* other processes may have the other ends of pipes        */
 	bool with_tcp;          /* count the bytes of connections, during a freeze, too      */

@@ -16,7 +16,6 @@
 #include <signal.h>
 #include <stdio.h>
 #include <string.h>
-#include <sys/stat.h>
 #include <sys/syscall.h>
 #include <unistd.h>
 
@@ -29,18 +28,6 @@
 #define SPARSE 2
 #define SAMPLES 16
 #define ENDS_NS NS_PER_S
-
-/* How many it has; 0 before Linux 6.2, which does not tell. */
-static int64_t size_of_table(pid_t pid)
-{
-	const int dir = proc_open(pid, "fd", O_RDONLY | O_DIRECTORY);
-	struct stat st = { 0 };
-	const int result = dir < 0 ? -1 : fstat(dir, &st);
-
-	if (dir >= 0)
-		close(dir);
-	return result ? 0 : st.st_size;
-}
 
 /* A socket that has to be made anew may need a port that a connection keeps. */
 static bool makes_socket(const struct files_work *work)
@@ -107,11 +94,9 @@ static bool may_ask(const struct process *process)
 static int start(const struct process *process)
 {
 	struct avc_error ignored = { 0 };
-	struct arch_regs base;
 
-	return arch_regs_get(process->holder, &base) ||
-			       parasite_send(&process->parasite, process->holder, &base,
-					     &process->parasite.control->holder, &ignored) ||
+	return parasite_send(&process->parasite, process->holder, &process->holder_base,
+			     &process->parasite.control->holder, &ignored) ||
 			       parasite_start(process->holder, &ignored)
 		       ? -1
 		       : 0;
@@ -137,7 +122,7 @@ void files_take_late(const struct files_work *work)
 {
 	struct process *process = work->process;
 	struct inj_call *call = &process->parasite.control->holder;
-	const int64_t open = work->table ? size_of_table(work->table) : 0;
+	const int64_t open = work->now->open;
 
 	if (open < LATE_LEAST + (int64_t)work->now->count || open > LATE_MAX || !process->holder ||
 	    makes_socket(work) || !are_mostly_sockets(work->table, open) || !may_ask(process))
@@ -166,14 +151,11 @@ void files_await_late(const struct process *process)
 		end(process);
 }
 
-void files_drop_late(const struct process *process)
+bool files_start_closing(const struct process *process)
 {
 	struct inj_call *call = &process->parasite.control->holder;
 
-	if (!process->late)
-		return;
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_close_range, 0, ~0u);
-	if (start(process))
-		return; /* it was killed, and has nothing open any more */
+	return start(process) == 0;
 }

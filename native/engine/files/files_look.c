@@ -228,6 +228,8 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 		result = walk_before(&look, err);
 	else
 		result = walk(&look, 0, err);
+	if (depth == FILES_NOW)
+		files->open = size_of_table(&look);
 	close(look.fd_dir);
 	files->served = depth == FILES_BEFORE ? mounts_may_be_served(&look.mounts, pid)
 					      : known && known->served;

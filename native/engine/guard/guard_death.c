@@ -184,7 +184,8 @@ static void keep_remains(struct avc_guard *guard)
 		return;
 	}
 	guard_release_oldest_remains(guard, REMAINS_MAX - 1);
-	files_drop_late(&guard->main);
+	if (guard->main.late)
+		(void)files_start_closing(&guard->main);
 	i = guard->remains_count++;
 	guard->remains[i].pid = process_detach_holder(&guard->main, &guard->remains[i].pidfd);
 	guard->remains[i].until_ns = now_ns() + guard->config.remains_ns;

@@ -691,8 +691,7 @@ int process_infect_stopped(struct process *process, uint32_t slots, struct avc_e
 }
 
 /* Turns a new task into the holder: stopped, named, and outside of the app's process groups. */
-static int make_holder(struct process *process, pid_t holder, const struct arch_regs *base,
-		       struct avc_error *err)
+static int make_holder(struct process *process, pid_t holder, struct avc_error *err)
 {
 	struct inj_call *own = &process->parasite.control->holder;
 	const struct sched_param first = { .sched_priority = 1 };
@@ -706,7 +705,7 @@ static int make_holder(struct process *process, pid_t holder, const struct arch_
 	 * numbers would stay taken. */
 	call_add(own, SYS_setsid);
 	call_add(own, SYS_prctl, PR_SET_NAME, parasite_remote(&process->parasite, own->out));
-	return parasite_send(&process->parasite, holder, base, own, err) ||
+	return parasite_send(&process->parasite, holder, &process->holder_base, own, err) ||
 			       parasite_run(holder, own, err)
 		       ? -1
 		       : 0;
@@ -780,7 +779,6 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 {
 	struct inj_call *call = &process->parasite.control->runner;
 	struct thread *thread;
-	struct arch_regs base;
 	pid_t holder = 0;
 	int result;
 
@@ -817,11 +815,12 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	tracee_deadline_set(timer, NS_PER_S);
 	if (tracee_await(holder, NULL, err) != STOP_TRAP)
 		result = -1;
-	if (parasite_own(&process->parasite, holder) || arch_regs_get(holder, &base))
+	if (parasite_own(&process->parasite, holder) ||
+	    arch_regs_get(holder, &process->holder_base))
 		result = fail_errno(err, holder, "make holder", "ptrace(SETOPTIONS)",
 				    "it has ended");
 	if (!result)
-		result = make_holder(process, holder, &base, err);
+		result = make_holder(process, holder, err);
 	tracee_deadline_clear(timer);
 	return keep_holder(process, holder, result, err);
 }
@@ -923,7 +922,7 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
 		result = clone_holder(process, between, &holder, err);
 	tracee_kill(between);
 	if (!result)
-		result = make_holder(process, holder, &process->holder_base, err);
+		result = make_holder(process, holder, err);
 	if (!result && proc_stat(holder, &stat))
 		result = fail_errno(err, holder, "make holder", "open(stat)", "it was killed");
 	if (!result && stat.parent != init)

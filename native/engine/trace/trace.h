@@ -194,6 +194,7 @@ struct process {
 	pid_t holder;  /* 0: none                                          */
 	pid_t holder_inside;
 	int holder_pidfd;
+	struct arch_regs holder_base; /* a user context of it                              */
 	struct thread *threads;
 	uint32_t thread_count, thread_room;
 	uint64_t due_ns; /* when the first of its calls has to be ended (waits.c)  */
@@ -248,7 +249,6 @@ struct process {
 	bool descendant;
 	uint64_t start;               /* start time; tells it from one with the same PID  */
 	uint32_t images;              /* generations that have one of it                  */
-	struct arch_regs holder_base; /* a user context of the holder, which clones       */
 	enum freeze_stage stage;      /* in this freeze                                    */
 	bool cloning;                 /* by its holder, the main one by itself: freeze_tree()  */
 	pid_t cloned;                 /* it is done already, and this is the clone; 0: no      */
