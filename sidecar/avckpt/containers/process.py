@@ -82,6 +82,27 @@ def open_pidfd(pid: int, started: int) -> int:
     return pidfd
 
 
+def open_app(pid: int, init: int, init_pidfd: int) -> int:
+    """A pidfd of the application `pid` below that avckpt-init; the caller closes it.  Raises TargetGone."""
+    if pid == init:  # there is no avckpt-init
+        return os.dup(init_pidfd)
+    try:
+        pidfd = os.pidfd_open(pid)
+    except OSError as error:
+        raise TargetGone("its application does not run", pid=pid) from error
+    # Checked only now: the pidfd refers to one process for good. A reused PID is not init's child, or is one
+    # of our templates.
+    try:
+        fields = status(pid)
+        is_ours = int(fields["PPid"]) == init and not fields["Name"].startswith("avckpt-")
+    except OSError:
+        is_ours = False
+    if not is_ours or has_ended(pidfd):
+        os.close(pidfd)
+        raise TargetGone("its application does not run", pid=pid)
+    return pidfd
+
+
 def has_ended(pidfd: int) -> bool:
     """Whether the process of a pidfd has ended (a zombie has)."""
     poller = select.poll()

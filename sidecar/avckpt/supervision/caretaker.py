@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Supervises the daemon's containers beyond deaths: their health, and the memory of their
-generations.
+"""Supervises the daemon's containers beyond deaths: their health, the memory of their generations,
+and what the OOM killer leaves of them.
 
 One per daemon, in its event loop. It only sends commands to guards; the results reach it
 as events.
@@ -24,6 +24,7 @@ from avckpt.errors import Busy, TargetGone
 from avckpt.events.record import EventRecord
 from avckpt.guard import Command
 from avckpt.supervision.health import Ward, watch_health
+from avckpt.supervision.oom_group import OomGroup, oom_group_of
 from avckpt.supervision.pressure import (
     Advice,
     Allowance,
@@ -48,6 +49,7 @@ class _Care(Generic[W]):
     groups: Groups
     """Where its memory is counted, and limited now or later."""
     allowance: Allowance = field(default_factory=Allowance)
+    oom_group: OomGroup | None = None
     health: asyncio.Task[None] | None = None
 
 
@@ -75,6 +77,7 @@ class Caretaker(Generic[W]):
         except OSError:  # it has just ended
             groups = Groups((), None, ())
         care = self._cares[ward.container.cookie] = _Care(ward, groups)
+        care.oom_group = oom_group_of(groups, ward.container, ward.pidfd)
         self._tell_limit(care, care.groups.memory_used_bytes())
         if policy.restore_on.unhealthy:
             self._watch_health(care)
@@ -98,12 +101,16 @@ class Caretaker(Generic[W]):
         care = self._cares.pop(ward.container.cookie, None)
         if care is not None and care.health is not None:
             care.health.cancel()
+        if care is not None and care.oom_group is not None:
+            care.oom_group.give_back()
+            care.oom_group = None
 
     async def close(self) -> None:
         """Ends everything that is under way."""
         tasks = [care.health for care in self._cares.values() if care.health is not None]
+        for care in list(self._cares.values()):
+            self.end(care.ward)
         tasks += [task for task in (self._looking, self._relieving) if task is not None]
-        self._cares.clear()
         for task in tasks:
             task.cancel()
         if tasks:
@@ -138,6 +145,8 @@ class Caretaker(Generic[W]):
             if self._host is not None and self._host.fd is None:
                 self._look_at_host()
             for care in list(self._cares.values()):
+                if care.oom_group is not None:
+                    care.oom_group.look(care.ward.container, care.ward.pidfd)
                 limited = care.ward.container.config.memory_limit_bytes or care.allowance.short
                 if not limited and number % SELDOM:
                     continue

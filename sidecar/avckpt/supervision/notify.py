@@ -24,7 +24,7 @@ from avckpt_hooks.shared.labels import Notify
 from avckpt_hooks.shared.tell import printable
 
 from avckpt.containers.looks import look
-from avckpt.containers.process import has_ended, pid_of
+from avckpt.containers.process import has_ended, open_app, pid_of
 from avckpt.containers.process import status as status_of
 from avckpt.containers.protected import Protected
 from avckpt.errors import AvckptError, Busy, TargetGone, of_any
@@ -181,30 +181,11 @@ async def _app_of(receiver: _Receiver) -> int:
     deadline = loop.time() + APP_TIMEOUT_S
     while True:
         try:
-            return _open_app(receiver.container, receiver.pidfd)
+            return open_app(receiver.container.app_pid, receiver.container.init_pid, receiver.pidfd)
         except TargetGone:
             if loop.time() > deadline or has_ended(receiver.pidfd):
                 raise
         await asyncio.sleep(0.02)
-
-
-def _open_app(container: Protected, init_pidfd: int) -> int:
-    """A pidfd of its application as currently known.  Raises TargetGone."""
-    pid = container.app_pid
-    if pid == container.init_pid:  # there is no avckpt-init
-        return os.dup(init_pidfd)
-    try:
-        pidfd = os.pidfd_open(pid)
-    except OSError as error:
-        raise TargetGone("its application does not run", pid=pid) from error
-    # Checked only now: the pidfd refers to one process for good. A reused PID is not init's child, or is one
-    # of our templates.
-    status = _status(pid)
-    is_ours = int(status.get("PPid", 0)) == container.init_pid and not status["Name"].startswith("avckpt-")
-    if not is_ours or has_ended(pidfd):
-        os.close(pidfd)
-        raise TargetGone("its application does not run", pid=pid)
-    return pidfd
 
 
 async def _send(app: int, number: int) -> None:
