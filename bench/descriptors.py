@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Restores of a program that has opened thousands of descriptors since its checkpoint.
 
-    .venv/bin/python -m bench.descriptors [--counts 0,5000,19800] [--restores 20]
+    .venv/bin/python -m bench.descriptors [--counts 0,5000,19800] [--restores 20] [--in-child]
 
 tests/victims/openings.c opens so many of a kind, with or without having closed a file that it had
-open at the checkpoint, and is killed.  Prints median and longest time, in ms, from the death's
-report until the program runs again; and what close_range(2) of as many takes in an
-unprotected process, in turns with the restores.
+open at the checkpoint, and is killed; with --in-child its child does so, and both are.  Prints
+median and longest time, in ms, from the death's report until the program runs again; and what
+close_range(2) of as many takes in an unprotected process, in turns with the restores.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def restores_ms(kind: str, closes: str, opened: int, restores: int, folder: Path
         for _ in range(restores):
             kernel.append(kernel_ms(kind, opened))
             before, since = victim.see().counter[0], guard.mark()
-            victim.kill_app(signal.SIGUSR1)
+            os.kill(victim.player, signal.SIGUSR1)
             wait_until(partial(is_past, victim, before), 30, "they are open")
             victim.kill_app()
             event = guard.wait("restored", since=since)
@@ -97,7 +97,9 @@ def main() -> None:
     parser.add_argument("--counts", default="0,5000,19800", help="%(default)s")
     parser.add_argument("--kinds", default=",".join(KINDS), help="%(default)s")
     parser.add_argument("--restores", type=int, default=20, help="%(default)s")
+    parser.add_argument("--in-child", action="store_true")
     asked = parser.parse_args()
+    where = " --in-child" if asked.in_child else ""
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     build()
     print("opened  kind              median  longest  kernel alone")
@@ -105,7 +107,7 @@ def main() -> None:
         for count in map(int, asked.counts.split(",")):
             with tempfile.TemporaryDirectory() as folder:
                 resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-                found, kernel = restores_ms(kind, closes, count, asked.restores, Path(folder))
+                found, kernel = restores_ms(kind, closes + where, count, asked.restores, Path(folder))
             print(
                 f"{count:6}  {kind + closes:16} {statistics.median(found):7.2f}  {max(found):7.2f}"
                 f"  {statistics.median(kernel):12.2f}",

@@ -84,13 +84,6 @@ static void pause_us(int64_t us)
 	SYS2(__NR_nanosleep, &t, 0);
 }
 
-static void make_list(struct inj_syscall *s, uint64_t count)
-{
-	for (uint64_t i = 0; i < count; i++)
-		s[i].result = raw_syscall(s[i].nr, s[i].arg[0], s[i].arg[1], s[i].arg[2],
-					  s[i].arg[3], s[i].arg[4], s[i].arg[5]);
-}
-
 /* Only new memory shows it: locked memory cannot be dropped, and is present at once unless it is
  * locked on fault. */
 static long find_future_lock(void)
@@ -214,14 +207,23 @@ static bool claims(uint64_t fd, bool *nameless)
 	return !*nameless && !was_accepted(fd);
 }
 
-static void close_claims(uint64_t fd, uint64_t count)
+static void close_claims(uint64_t fd, uint64_t last)
 {
 	bool nameless = false;
 
-	for (uint64_t end = fd + count; fd < end; fd++)
+	for (; fd <= last; fd++)
 		if (claims(fd, &nameless))
 			SYS1(__NR_close, fd);
-	SYS3(__NR_close_range, fd, (uint32_t)-1, 0);
+}
+
+static void make_list(struct inj_syscall *s, uint64_t count)
+{
+	for (; count; count--, s++)
+		if (s->nr == INJ_CLOSE_CLAIMS)
+			close_claims(s->arg[0], s->arg[1]);
+		else
+			s->result = raw_syscall(s->nr, s->arg[0], s->arg[1], s->arg[2], s->arg[3],
+						s->arg[4], s->arg[5]);
 }
 
 /* A tracer can interrupt it: not ours, but the next one when ours has died.  So it sleeps as park()
@@ -259,16 +261,13 @@ __attribute__((section(".text.entry"))) void inj_run(uint64_t result, struct inj
 			alone = !make_pause(call);
 		else if (s->nr == INJ_FUTURE_LOCK)
 			s->result = find_future_lock();
-		else if (s->nr == INJ_CLOSE_CLAIMS)
-			close_claims(s->arg[0], s->arg[1]);
 		else if (s->nr == INJ_CAPS)
 			s->result = find_caps(s->arg[0], (const uint32_t *)s->arg[1]);
 		else if (s->nr == __NR_clone)
 			s->result = inj_clone(s->arg[0], s->arg[1], s->arg[2], s->arg[3],
 					      s->arg[4]);
 		else
-			s->result = raw_syscall(s->nr, s->arg[0], s->arg[1], s->arg[2], s->arg[3],
-						s->arg[4], s->arg[5]);
+			make_list(s, 1);
 	}
 	__atomic_store_n(&call->done, 1, __ATOMIC_RELEASE);
 	if (call->after == INJ_AFTER_HOME && !call->park_ms && !call->wills)

@@ -62,9 +62,8 @@ struct inj_timer {
 /* The result is a set of capabilities: the bounding set (arg[0] PR_CAPBSET_READ) or the ambient one
  * (PR_CAP_AMBIENT; arg[1]: where capget(2) has stored the others). */
 #define INJ_CAPS (-5)
-/* Closes what is open from number arg[0] on, except what claims nothing that others could miss at
- * once: connections and sockets without a name, and pipes.  Looks at arg[1] numbers, and closes all
- * above. */
+/* Closes what is open from number arg[0] to arg[1], except what claims nothing that others could miss
+ * at once: connections and sockets without a name, and pipes. */
 #define INJ_CLOSE_CLAIMS (-6)
 
 enum inj_after {

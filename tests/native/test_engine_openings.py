@@ -15,6 +15,8 @@ from testkit.harness import wait_until
 
 THOUSANDS = 5000
 """More than LATE_LEAST of files_late.c."""
+LISTENER = 99
+"""The descriptor in openings.c."""
 
 
 @pytest.fixture(autouse=True)
@@ -44,6 +46,25 @@ def test_nobody_else_has_what_only_one_can_have(kind: str, closes: str, where: s
         assert guard.checkpoint()["kind"] == "checkpoint"
         for _ in range(4):
             open_and_die(guard, victim)
+
+
+def tcp_with_port_of(listener: str) -> int:
+    """How many TCP sockets have, at either end, the port of that link in /proc/PID/fd."""
+    inode = os.readlink(listener)[len("socket:[") : -1]
+    lines = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    port = next(line[1].split(":")[1] for line in lines if line[9] == inode)
+    return sum(port in (line[1].split(":")[1], line[2].split(":")[1]) for line in lines)
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_connections_end_for_their_peers(where: str, tmp_path: Path) -> None:
+    with (
+        Victim(f"openings {THOUSANDS} peers {where}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        assert guard.checkpoint()["kind"] == "checkpoint"
+        open_and_die(guard, victim)
+        wait_until(lambda: tcp_with_port_of(f"/proc/{victim.player}/fd/{LISTENER}") == 1, PATIENCE_S, "they end", 0.01)
 
 
 def is_closed(pid: int) -> bool:

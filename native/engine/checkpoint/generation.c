@@ -371,20 +371,26 @@ void generation_close_files(const struct image *image, bool shared)
 		return; /* it was killed, and has nothing open any more */
 }
 
-void generation_close_tables(const struct generation *generation)
+static bool start_closing(const struct generation *generation, uint32_t i, bool late)
+{
+	const struct image *image = &generation->image[i];
+	const uint32_t owner = image_table_owner(generation->image, i);
+	const struct process *process = image->process;
+
+	/* The main process has its old one again; others have left theirs. */
+	if (!process || !process->holder || (late && !process->late) ||
+	    (owner != i && (!owner || generation->image[owner].process->holder)))
+		return false;
+	return process->late && !late ? files_start_closing_claims(process, image->files)
+				      : files_start_closing(process);
+}
+
+void generation_close_tables(const struct generation *generation, bool late)
 {
 	bool closing[PROCESSES_MAX] = { false };
 
-	for (uint32_t i = 1; i < generation->images; i++) {
-		const struct image *image = &generation->image[i];
-		const uint32_t owner = image_table_owner(generation->image, i);
-		struct process *process = image->process;
-
-		/* The main process has its old one again; others have left theirs. */
-		closing[i] = process && process->holder &&
-			     (owner == i || (owner && !generation->image[owner].process->holder)) &&
-			     files_start_closing(process);
-	}
+	for (uint32_t i = 1; i < generation->images; i++)
+		closing[i] = start_closing(generation, i, late);
 	for (uint32_t i = 1; i < generation->images; i++) {
 		struct process *process = generation->image[i].process;
 		struct avc_error gone = { 0 };

@@ -93,6 +93,10 @@ void files_await_late(const struct process *process);
 /* Has the holder close all that its table has, and does not wait; it must have one that the application
  * does not use.  False: it was killed, and has nothing open any more. */
 bool files_start_closing(const struct process *process);
+/* The same, of a table where claims have been looked for (process->late): only what the process `had`. */
+bool files_start_closing_claims(const struct process *process, const struct files *had);
+/* What the holder of the main process has left (process->late).  Afterwards it is used no more. */
+void files_close_late(const struct process *process);
 /* A process that is being restored opens its pidfds itself: raises its descriptor limit for that,
  * until it sets the limit again. */
 void files_lift_limit(const struct files *want, pid_t pid);
@@ -613,6 +617,8 @@ void files_note(struct files_work *work, const struct file *f, const char *probl
 
 /* Before the listed calls close what is new: leaves thousands of connections to the holder. */
 void files_take_late(const struct files_work *work);
+/* Whether to do so: what has a number below is looked at.  0: it is not worthwhile, or not possible. */
+uint64_t files_looked_at(const struct files_work *work);
 
 uint32_t files_index(const struct files *files, const struct file *file);
 /* Index of the first descriptor of the same open file description. */

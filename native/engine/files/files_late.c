@@ -10,6 +10,9 @@
  *
  * The holder never closes anything in the application's table: if it gets no CPU for long, that is
  * in use again by then.
+ *
+ * Other processes of the application get new tables.  Their holders close in the old ones what claims
+ * something and what is in both, and the rest when the application runs again.
  */
 #include <fcntl.h>
 #include <linux/close_range.h>
@@ -55,7 +58,7 @@ static bool close_kept(const struct files_work *work, struct inj_call *call)
 		while (next < now->count && !work->closed[next] &&
 		       now->file[next].fd == now->file[next - 1].fd + 1)
 			next++;
-		if (call->count == INJ_CALLS_MAX - 1)
+		if (call->count == INJ_CALLS_MAX - 2)
 			return false;
 		call_add(call, SYS_close_range, (uint64_t)now->file[i].fd,
 			 (uint64_t)now->file[next - 1].fd);
@@ -118,14 +121,24 @@ static void end(const struct process *process)
 	(void)poll_for(&ends, 1, ENDS_NS);
 }
 
+uint64_t files_looked_at(const struct files_work *work)
+{
+	const int64_t open = work->now->open;
+
+	return open >= LATE_LEAST + (int64_t)work->now->count && open <= LATE_MAX &&
+			       work->process->holder && !makes_socket(work) &&
+			       are_mostly_sockets(work->table, open) && may_ask(work->process)
+		       ? (uint64_t)(SPARSE * open)
+		       : 0;
+}
+
 void files_take_late(const struct files_work *work)
 {
 	struct process *process = work->process;
 	struct inj_call *call = &process->parasite.control->holder;
-	const int64_t open = work->now->open;
+	const uint64_t looked_at = files_looked_at(work);
 
-	if (open < LATE_LEAST + (int64_t)work->now->count || open > LATE_MAX || !process->holder ||
-	    makes_socket(work) || !are_mostly_sockets(work->table, open) || !may_ask(process))
+	if (!looked_at)
 		return;
 	call_begin(call, INJ_AFTER_PARK);
 	/* Filters that forbid unshare(2) allow this. */
@@ -138,7 +151,8 @@ void files_take_late(const struct files_work *work)
 		return;
 	call_begin(call, INJ_AFTER_PARK);
 	if (close_kept(work, call)) {
-		call_add(call, INJ_CLOSE_CLAIMS, 0, (uint64_t)(SPARSE * open));
+		call_add(call, INJ_CLOSE_CLAIMS, 0, looked_at - 1);
+		call_add(call, SYS_close_range, looked_at, ~0u);
 		process->late = start(process) == 0;
 	}
 	if (!process->late)
@@ -158,4 +172,28 @@ bool files_start_closing(const struct process *process)
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_close_range, 0, ~0u);
 	return start(process) == 0;
+}
+
+bool files_start_closing_claims(const struct process *process, const struct files *had)
+{
+	struct inj_call *call = &process->parasite.control->holder;
+	uint32_t next;
+
+	call_begin(call, INJ_AFTER_PARK);
+	for (uint32_t i = 0; i < had->count; i = next) {
+		next = i + 1;
+		while (next < had->count && had->file[next].fd == had->file[next - 1].fd + 1)
+			next++;
+		if (call->count == INJ_CALLS_MAX)
+			return files_start_closing(process);
+		call_add(call, SYS_close_range, (uint64_t)had->file[i].fd,
+			 (uint64_t)had->file[next - 1].fd);
+	}
+	return start(process) == 0;
+}
+
+void files_close_late(const struct process *process)
+{
+	if (files_start_closing(process) && finish(process))
+		end(process);
 }

@@ -491,10 +491,20 @@ static bool is_new(const struct files_work *work, const struct file *n)
 	return !w || work->lost[files_index(work->want, w)];
 }
 
+/* Of numbers below `looked_at` only what claims something (files_late.c). */
 static int close_range_of(struct files_work *work, uint64_t first, uint64_t last,
-			  struct avc_error *err)
+			  uint64_t looked_at, struct avc_error *err)
 {
-	return first > last ? 0 : inject(work, err, SYS_close_range, first, last, 0);
+	const uint64_t looked_last = last < looked_at ? last : looked_at - 1;
+
+	if (first > last)
+		return 0;
+	if (first >= looked_at)
+		return inject(work, err, SYS_close_range, first, last, 0);
+	return inject(work, err, INJ_CLOSE_CLAIMS, first, looked_last, 0) ||
+			       close_range_of(work, looked_last + 1, last, looked_at, err)
+		       ? -1
+		       : 0;
 }
 
 /* Whatever the checkpoint does not have, in ranges: a program may have opened thousands since,
@@ -502,10 +512,13 @@ static int close_range_of(struct files_work *work, uint64_t first, uint64_t last
 static int close_new(struct files_work *work, struct avc_error *err)
 {
 	const struct files *now = work->now;
-	uint64_t next = 0;
+	uint64_t next = 0, looked_at = 0;
 
 	if (!work->table)
 		return 0;
+	if (work->process->descendant)
+		looked_at = files_looked_at(work);
+	work->process->late = looked_at > 0;
 
 	for (uint32_t i = 0; i < now->count; i++) {
 		const uint64_t fd = (uint64_t)now->file[i].fd;
@@ -513,11 +526,11 @@ static int close_new(struct files_work *work, struct avc_error *err)
 		work->closed[i] = is_new(work, &now->file[i]);
 		if (work->closed[i])
 			continue;
-		if (fd && close_range_of(work, next, fd - 1, err))
+		if (fd && close_range_of(work, next, fd - 1, looked_at, err))
 			return -1;
 		next = fd + 1;
 	}
-	return close_range_of(work, next, UINT32_MAX, err);
+	return close_range_of(work, next, UINT32_MAX, looked_at, err);
 }
 
 /* Cheaper to set than to check; and by the template, for which the app's own seccomp filter is

@@ -75,6 +75,7 @@ static void adopt_family(struct avc_guard *guard, const struct generation *gener
 {
 	struct tree *tree = &guard->tree;
 
+	generation_close_tables(generation, true);
 	for (uint32_t i = 0; i < tree->processes; i++)
 		if (tree->process[i]->descendant)
 			tree_let_go(tree->process[i]);
@@ -185,7 +186,7 @@ static void keep_remains(struct avc_guard *guard)
 	}
 	guard_release_oldest_remains(guard, REMAINS_MAX - 1);
 	if (guard->main.late)
-		(void)files_start_closing(&guard->main);
+		files_close_late(&guard->main);
 	i = guard->remains_count++;
 	guard->remains[i].pid = process_detach_holder(&guard->main, &guard->remains[i].pidfd);
 	guard->remains[i].until_ns = now_ns() + guard->config.remains_ns;

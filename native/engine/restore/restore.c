@@ -403,7 +403,7 @@ static int make(struct restore *restore, struct avc_error *err)
 	if (result || (restore->tree && restore_tree_start(restore->tree, err)))
 		return -1;
 	files_await_late(generation->image[0].process);
-	generation_close_tables(generation);
+	generation_close_tables(generation, false);
 	return 0;
 }
 
