@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 from avckpt.cli.client import Client
-from avckpt.evidence.deaths import PROCESSES_MAX, RING_PAGES_MAX, Deaths
+from avckpt.evidence.deaths import PROCESSES_MAX, RING_PAGES_MAX, THREADS_ALL, Deaths
 
 from testkit.harness import take_checkpoint, wait_until
 from testkit.local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, local_sidecar
@@ -212,6 +212,39 @@ def test_a_death_that_was_not_heard_of_has_a_core_all_the_same(sidecar: LocalSid
 
     # And the next one is known again.
     assert crash_by(sidecar, victim, signal.SIGUSR1)["crash"]["code"] == "SEGV_MAPERR"
+
+
+@pytest.mark.timeout(180)
+def test_threads_of_others_fill_no_memory(sidecar: LocalSidecar) -> None:
+    """Nobody will ask for what is known of them."""
+    many = "import os, threading\nthreading.stack_size(65536)\nlock = threading.Lock()\nlock.acquire()\n"
+    many += "for _ in range(2000):\n    threading.Thread(target=lock.acquire).start()\nos.kill(os.getpid(), 9)"
+    assert sidecar.process is not None
+    before_kb = peak_kb(sidecar.process.pid)
+    for _ in range(3 * THREADS_ALL // 2000):
+        subprocess.run([sys.executable, "-c", many], check=False, timeout=60)
+    victim = sidecar.protected("victim", [sys.executable, "-c", VICTIM], ON_COMMAND)
+    assert crash_by(sidecar, victim, signal.SIGUSR1)["crash"]["signal"] == "SIGSEGV"
+    assert peak_kb(sidecar.process.pid) < before_kb + 30_000
+
+
+def test_a_stop_is_no_death() -> None:
+    """Nor does one that a thread has survived stand for its death."""
+    cpu = min(os.sched_getaffinity(0))
+    deaths = Deaths(set, pages=16)
+    try:
+        with subprocess.Popen(["taskset", "--cpu-list", str(cpu), "sleep", "1000"]) as process:
+            wait_until(lambda: comm_of(process.pid) == "sleep", 10, "it sleeps")
+            process.send_signal(signal.SIGSTOP)
+            os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WNOWAIT)
+            process.send_signal(signal.SIGCONT)
+            killed_ns = time.monotonic_ns()
+            process.kill()
+        hit = deaths.of(process.pid).fatal(signal.SIGKILL)
+    finally:
+        deaths.close()
+    assert hit is not None
+    assert (hit.signal, hit.at_ns > killed_ns) == (signal.SIGKILL, True)
 
 
 def test_signals_without_a_death_wake_nobody() -> None:

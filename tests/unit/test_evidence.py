@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from avckpt.events.vocabulary import Kind
-from avckpt.evidence.collector import Collector
+from avckpt.evidence.collector import Collector, _name_of
 from avckpt.evidence.crash import Crash, Frame, code_name, crash_of, fingerprint, placed
 from avckpt.evidence.deaths import Death, Delivery, Sent
 from avckpt.evidence.kernel_log import Fault, fault_of
@@ -72,6 +72,20 @@ def test_who_sent_it() -> None:
     by_kernel = Death(5, {5: delivery(5, 9)}, [Sent(90, 9, 128, 99, 5, "app")])
     crash = crash_of("SIGKILL", by_kernel.fatal(9), by_kernel, None)
     assert (crash.code, crash.sender, crash.sender_pid) == ("SI_KERNEL", "kernel", 0)
+
+
+def test_names_of_threads_and_senders_control_no_terminal() -> None:
+    name = "\x1b[2J\nok"
+    crash = crash_of("SIGABRT", delivery(5, 6), Death(5, {}, [Sent(90, 6, 0, os.getpid(), 5, name)]), None)
+    assert crash.thread == "\\x1b[2J\\nok"
+    assert crash_of("SIGABRT", delivery(5, 6), Death(5), Fault(name, None)).thread == crash.thread
+
+    before = Path("/proc/self/comm").read_text()
+    Path("/proc/self/comm").write_text(name)
+    try:
+        assert _name_of(os.getpid()) == crash.thread
+    finally:
+        Path("/proc/self/comm").write_text(before)
 
 
 def test_a_kill_does_not_tell_the_code_of_the_signal_behind_it() -> None:

@@ -9,11 +9,13 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from avckpt_hooks.shared.tell import printable
+
 from avckpt.containers.looks import look
 from avckpt.errors import AvckptError
 from avckpt.events.vocabulary import signal_name
 from avckpt.evidence.crash import Crash, Frame, crash_of, fingerprint, placed
-from avckpt.evidence.deaths import Death, Deaths, Delivery
+from avckpt.evidence.deaths import WAKE_BYTES, Death, Deaths, Delivery
 from avckpt.evidence.kernel_log import KernelLog
 from avckpt.evidence.remains import Remains, check_parent, command_of
 from avckpt.guard import Event
@@ -66,11 +68,16 @@ class Collector:
             log.info("where applications die will not be known: %s", error)
             return
         for fd in self._deaths.fds:
-            asyncio.get_running_loop().add_reader(fd, self._deaths.take)
+            asyncio.get_running_loop().add_reader(fd, self._hear)
         try:
             self._log = KernelLog()
         except OSError as error:
             log.info("addresses of faults will not be known: /dev/kmsg: %s", error.strerror)
+
+    def _hear(self) -> None:
+        # Whatever else has to be done comes in between: thousands of threads may die at once.
+        if self._deaths is not None and self._deaths.take(WAKE_BYTES):
+            asyncio.get_running_loop().call_soon(self._hear)
 
     def close(self) -> None:
         """Hears no more."""
@@ -172,6 +179,6 @@ def _frames(remains: Remains, hit: Delivery | None) -> list[Frame]:
 
 def _name_of(pid: int) -> str:
     try:
-        return Path(f"/proc/{pid}/comm").read_text(errors="replace").strip()
+        return printable(Path(f"/proc/{pid}/comm").read_text(errors="replace").rstrip("\n"))
     except OSError:
         return ""

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, cast
 
+from avckpt_hooks.shared.tell import printable
+
 from avckpt.events.vocabulary import signal_name
 from avckpt.evidence.deaths import Death, Delivery
 from avckpt.evidence.kernel_log import Fault
@@ -122,7 +124,7 @@ def crash_of(signal: str, hit: Delivery | None, death: Death, fault: Fault | Non
         code="" if code is None else code_name(signal, code),
         fault=f"{fault.address:#x}" if fault is not None and fault.address is not None else "",
         tid=hit.tid,
-        thread=name,
+        thread=printable(name),
         sender_pid=last.sender_pid if last is not None and outside else 0,
         sender="kernel" if code == 128 and signal == "SIGKILL" else "",
     )

@@ -23,12 +23,14 @@ import contextlib
 import ctypes
 import fcntl
 import logging
+import math
 import mmap
 import os
 import platform
 import signal
 import struct
-from collections import OrderedDict
+import time
+from collections import OrderedDict, deque
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -47,7 +49,11 @@ CALLERS_MAX = 32
 PROCESSES_MAX = 256
 """Dead processes of others that are remembered; the oldest make way."""
 THREADS_MAX = 4096
-"""Of each."""
+"""Of each, ..."""
+THREADS_ALL = 16384
+"""... and of all others together: half a kilobyte for each."""
+SELDOM_S = 60.0
+"""What the kernel had no room for is logged at most this often."""
 SENT_MAX = 2048
 DELIVERED_PAGES = 2048
 """Rings of all CPUs together; each has a power of two, within these: """
@@ -58,7 +64,15 @@ WAKE_BYTES = 64 << 10
 OURS = ("avckpt-tmpl", "avckpt-spare", "avckpt-hold", "avckpt-guard")
 """Names of tasks that are killed, and kill, at every checkpoint."""
 _NOT_OURS = " && ".join(f'comm != "{name}"' for name in OURS)
-_DELIVER = f"sa_handler == 0 && {_NOT_OURS}"
+# Their default action ends nobody; anybody can send them as often as he likes.
+_DEADLY = " && ".join(
+    f"sig != {number}"
+    for number in (
+        *(signal.SIGSTOP, signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU),
+        *(signal.SIGCONT, signal.SIGCHLD, signal.SIGURG, signal.SIGWINCH),
+    )
+)
+_DELIVER = f"sa_handler == 0 && {_DEADLY} && {_NOT_OURS}"
 # Those that the CPU raises have no sender; SIGSEGV is left out, because runtimes live on it.
 _SENT = " || ".join(f"sig == {number}" for number in (signal.SIGSEGV, signal.SIGTERM, signal.SIGINT, signal.SIGQUIT))
 _ALWAYS = " || ".join(
@@ -133,7 +147,7 @@ class Death:
 
     pid: int = 0
     deliveries: dict[int, Delivery] = field(default_factory=dict)
-    """By thread; the first of each."""
+    """By thread."""
     sent: list[Sent] = field(default_factory=list)
 
     def fatal(self, signum: int) -> Delivery | None:
@@ -157,11 +171,14 @@ class Deaths:
     def __init__(self, protected: Callable[[], Collection[int]], pages: int = 0) -> None:
         if platform.machine() != "x86_64":
             raise Unsupported(f"registers of {platform.machine()} are not known", operation="hear of deaths")
-        self._known: OrderedDict[int, Death] = OrderedDict()
+        self._known: OrderedDict[int, dict[int, bytes]] = OrderedDict()
+        """The newest report of each thread, by process: of most nobody ever wants to know."""
         self._sent: OrderedDict[int, Sent] = OrderedDict()
         self._protected = protected
         self.lost = 0
         """Deaths of threads that the kernel had no room to report."""
+        self._lost_told = 0
+        self._lost_told_s = -math.inf
         self._delivered: list[_Ring] = []
         self._generated: list[_Newest] = []
         try:
@@ -187,17 +204,24 @@ class Deaths:
         """Readable when there is much to read: call `take()`."""
         return [ring.fd for ring in self._delivered]
 
-    def take(self) -> None:
-        """Reads who has died."""
-        lost = sum(ring.read(self._take_delivery) for ring in self._delivered)
-        if lost:
-            self.lost += lost
+    def take(self, most: int = RING_PAGES_MAX * mmap.PAGESIZE) -> bool:
+        """Reads who has died, `most` bytes of each CPU's ring; whether there is more."""
+        self.lost += sum(ring.read(self._take_delivery, most) for ring in self._delivered)
+        if self.lost > self._lost_told and time.monotonic() - self._lost_told_s >= SELDOM_S:
+            lost = self.lost - self._lost_told
             log.warning("too many deaths at once: the kernel had no room to report %d of a thread", lost)
-        if len(self._known) > PROCESSES_MAX:
-            protected = self._protected()
-            others = [pid for pid in self._known if pid not in protected]
-            for pid in others[:-PROCESSES_MAX]:
-                del self._known[pid]
+            self._lost_told, self._lost_told_s = self.lost, time.monotonic()
+        threads = sum(map(len, self._known.values()))
+        if len(self._known) > PROCESSES_MAX or threads > THREADS_ALL:
+            self._make_room()
+        return any(ring.is_behind() for ring in self._delivered)
+
+    def _make_room(self) -> None:
+        protected = self._protected()
+        others = deque(pid for pid in self._known if pid not in protected)
+        threads = sum(len(self._known[pid]) for pid in others)
+        while len(others) > PROCESSES_MAX or threads > THREADS_ALL:
+            threads -= len(self._known.pop(others.popleft()))
 
     def of(self, pid: int) -> Death:
         """What was heard of a process that has ended, in our PID namespace."""
@@ -206,7 +230,8 @@ class Deaths:
             ring.read(self._take_sent)
         while len(self._sent) > SENT_MAX:
             self._sent.popitem(last=False)
-        death = self._known.pop(pid, Death(pid))
+        threads = self._known.pop(pid, {})
+        death = Death(pid, {tid: _delivery_of(tid, body) for tid, body in threads.items()})
         tids = {pid, *death.deliveries}
         death.sent = [sent for sent in self._sent.values() if sent.tid in tids]
         return death
@@ -219,16 +244,14 @@ class Deaths:
         self._generated.clear()
 
     def _take_delivery(self, body: bytes) -> None:
-        pid, tid, at_ns, count = struct.unpack_from("=iiQQ", body)
-        chain = struct.unpack_from(f"={count}Q", body, 24)
-        at = 24 + 8 * count
-        (size,) = struct.unpack_from("=I", body, at)
-        signum, _, code = struct.unpack_from("=iii", body, at + 4 + 8)
-        callers = tuple(address for address in chain if address < _CONTEXT_FROM)[:CALLERS_MAX]
-        death = self._known.setdefault(pid, Death(pid))
-        if len(death.deliveries) < THREADS_MAX:
-            registers = _registers(body, at + 4 + size)
-            death.deliveries.setdefault(tid, Delivery(tid, at_ns, signum, code, callers, registers))
+        pid, tid, at_ns = struct.unpack_from("=iiQ", body)
+        threads = self._known.setdefault(pid, {})
+        self._known.move_to_end(pid)
+        known = threads.get(tid)
+        # Of an earlier process with that number, on whichever CPU.
+        older = known is not None and struct.unpack_from("=Q", known, 8)[0] < at_ns
+        if older or (known is None and len(threads) < THREADS_MAX):
+            threads[tid] = body
 
     def _take_sent(self, body: bytes) -> None:
         pid, _, at_ns, _ = struct.unpack_from("=iiQI", body)
@@ -282,21 +305,29 @@ class _Ring(_Event):
         fd = _open_event(cpu, tracepoint, sample, _FLAG_NO_KERNEL_CALLERS, wake)
         super().__init__(fd, _DELIVER, pages, mmap.PROT_READ | mmap.PROT_WRITE)
 
-    def read(self, take: Callable[[bytes], None]) -> int:
-        """Gives each sample to `take`, and frees its room; how many were lost."""
+    def read(self, take: Callable[[bytes], None], most: int) -> int:
+        """Gives each sample in the next `most` bytes to `take`, and frees its room; how many were lost."""
         assert self._map is not None
-        head, lost = self._head(), 0
         (tail,) = struct.unpack_from("Q", self._map, _TAIL)
-        while tail < head:
-            kind, _, length = _HEADER.unpack(self._bytes(tail, _HEADER.size))
-            body = self._bytes(tail + _HEADER.size, length - _HEADER.size)
+        new = self._bytes(tail, min(self._head() - tail, most))
+        lost = at = 0
+        while at + _HEADER.size <= len(new):
+            kind, _, length = _HEADER.unpack_from(new, at)
+            if at + length > len(new):
+                break  # the rest is for the next time
             if kind == _RECORD_SAMPLE:
-                take(body)
+                take(new[at + _HEADER.size : at + length])
             elif kind == _RECORD_LOST:
-                lost += struct.unpack_from("=QQ", body)[1]
-            tail += length
-        struct.pack_into("Q", self._map, _TAIL, tail)
+                lost += struct.unpack_from("=QQ", new, at + _HEADER.size)[1]
+            at += length
+        struct.pack_into("Q", self._map, _TAIL, tail + at)
         return lost
+
+    def is_behind(self) -> bool:
+        """Whether there is more to read."""
+        assert self._map is not None
+        (tail,) = struct.unpack_from("Q", self._map, _TAIL)
+        return self._head() > int(tail)
 
 
 class _Newest(_Event):
@@ -331,6 +362,16 @@ def _pages_of_ring(cpus: int) -> int:
     """A power of two."""
     wanted = max(RING_PAGES_MIN, min(RING_PAGES_MAX, DELIVERED_PAGES // cpus))
     return 1 << (wanted.bit_length() - 1)
+
+
+def _delivery_of(tid: int, body: bytes) -> Delivery:
+    _, _, at_ns, count = struct.unpack_from("=iiQQ", body)
+    chain = struct.unpack_from(f"={count}Q", body, 24)
+    at = 24 + 8 * count
+    (size,) = struct.unpack_from("=I", body, at)
+    signum, _, code = struct.unpack_from("=iii", body, at + 4 + 8)
+    callers = tuple(address for address in chain if address < _CONTEXT_FROM)[:CALLERS_MAX]
+    return Delivery(tid, at_ns, signum, code, callers, _registers(body, at + 4 + size))
 
 
 def _registers(body: bytes, at: int) -> dict[str, int]:

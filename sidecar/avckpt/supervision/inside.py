@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from avckpt_hooks.shared.files import TooLong, read_bounded
+from avckpt_hooks.shared.tell import printable
 
 from avckpt.artifacts import inside_binary
 from avckpt.containers.cgroup import groups_of
@@ -115,7 +116,7 @@ async def run_inside(
         os.close(failure_end)
         kept = await _wait(process, output, timeout_s + GRACE_S)
         took_s = time.monotonic() - started
-        said = os.read(failure, 512).decode(errors="replace").strip() if _readable(failure) else ""
+        said = printable(os.read(failure, 512).decode(errors="replace").strip()) if _readable(failure) else ""
     timed_out = said == "timeout" or process.returncode in (-signal.SIGALRM, -signal.SIGKILL)
     if said and not timed_out:
         if has_ended(init_pidfd):
