@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -14,9 +15,11 @@ from typing import Any
 import pytest
 from avckpt.cli.client import Client
 
+from testkit.guarded import BUILD
 from testkit.harness import wait_until
 from testkit.local_sidecar import QUICK, Container, LocalSidecar, ended
 from testkit.procfs import children_of, peak_kb
+from testkit.protected import build_victims
 
 SLEEPER = ["sleep", "1000"]
 # Says READY, then a line for every SIGUSR1.
@@ -217,6 +220,28 @@ def test_a_stuck_command_is_killed_and_hinders_nobody(local: LocalSidecar, tmp_p
     wait_until(lambda: len(children_of(stuck.init_pid)) <= before, 5, "nothing of ours is left inside")
     assert not [p for p in Path("/proc").iterdir() if p.name.isdigit() and _is_left(p)]
     assert not ended(stuck)
+
+
+def test_a_command_that_cannot_be_killed_hinders_nobody(local: LocalSidecar, tmp_path: Path) -> None:
+    """It waits for a file server, which has its request and does not answer."""
+    build_victims()
+    with subprocess.Popen([BUILD / "server", tmp_path, "head"], stdout=subprocess.PIPE) as server:
+        assert server.stdout is not None
+        if server.stdout.readline() != b"ready\n":
+            pytest.skip("/dev/fuse is not available here")
+        try:
+            web = protected(local, "web", {**QUICK, "avckpt.notify.self": f"exec:head {tmp_path}/mount/served"})
+            crash(local, web)
+            failed, slowest_s = [], 0.0
+            while not failed:
+                begun = time.monotonic()
+                failed = told(local, "notify_failed")
+                slowest_s = max(slowest_s, time.monotonic() - begun)
+            assert "killed after 5 s" in failed[0]["message"]
+            assert slowest_s < 0.3
+        finally:
+            server.kill()
+            subprocess.run(["umount", "-l", tmp_path / "mount"], check=True)
 
 
 def _is_left(process: Path) -> bool:

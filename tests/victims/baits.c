@@ -122,7 +122,7 @@ static int device;
 static void *serve(void *arg)
 {
 	for (;;)
-		server_serve(device);
+		server_serve(device, "avckpt-guard");
 	return arg;
 }
 

@@ -1,6 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- *   server FOLDER     mounts a file system of its own at FOLDER/mount (server.h)
+ *   server FOLDER [PROGRAM]    mounts a file system of its own at FOLDER/mount (server.h), which does
+ *                              not answer processes of that name (avckpt-guard)
  */
 #include "server.h"
 
@@ -14,5 +15,5 @@ int main(int argc, char **argv)
 	device = server_mount("/dev/fuse", path);
 	victim_ready();
 	for (;;)
-		server_serve(device);
+		server_serve(device, argc > 2 ? argv[2] : "avckpt-guard");
 }

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * A file server of one file (FUSE), which does not answer a guard.
+ * A file server of one file (FUSE), which does not answer one program.
  */
 #ifndef SERVER_H
 #define SERVER_H
@@ -44,7 +44,7 @@ static inline void server_answer(int device, uint64_t unique, int error, const v
 	must(write(device, answer, head.len) == (ssize_t)head.len || errno == ENOENT, "/dev/fuse");
 }
 
-static inline bool server_is_asked_by_guard(const struct fuse_in_header *in)
+static inline bool server_is_asked_by(const struct fuse_in_header *in, const char *program)
 {
 	char path[48], name[16] = "";
 	int comm;
@@ -55,7 +55,8 @@ static inline bool server_is_asked_by_guard(const struct fuse_in_header *in)
 		must(read(comm, name, sizeof name - 1) >= 0, path);
 		close(comm);
 	}
-	return !strcmp(name, "avckpt-guard\n");
+	name[strcspn(name, "\n")] = 0;
+	return !strcmp(name, program);
 }
 
 static inline void server_answer_to(int device, const struct fuse_in_header *in)
@@ -122,13 +123,13 @@ static inline int server_mount(const char *device_path, const char *path)
 	return device;
 }
 
-static inline void server_serve(int device)
+static inline void server_serve(int device, const char *unanswered)
 {
 	static char request[FUSE_MIN_READ_BUFFER + SERVED_BYTES] __attribute__((aligned(8)));
 	const struct fuse_in_header *in = (const struct fuse_in_header *)request;
 	const ssize_t n = read(device, request, sizeof request);
 
-	if (n > 0 && server_is_asked_by_guard(in))
+	if (n > 0 && server_is_asked_by(in, unanswered))
 		return;
 	if (n > 0)
 		server_answer_to(device, in);

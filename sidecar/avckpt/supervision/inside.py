@@ -30,7 +30,7 @@ from avckpt_hooks.shared.tell import printable
 
 from avckpt.artifacts import inside_binary
 from avckpt.containers.cgroup import groups_of
-from avckpt.containers.looks import look
+from avckpt.containers.looks import in_own_thread, look
 from avckpt.containers.process import has_ended, pid_of, status
 from avckpt.errors import AvckptError, KernelError, TargetGone
 
@@ -41,7 +41,7 @@ OUTPUT_BYTES = 4096
 GRACE_S = 2.0
 """How long after the timeout the helper itself is killed, which should have killed the command."""
 KILL_S = 0.5
-"""How long the helper has to kill its command after a cancellation."""
+"""How long the helper has to kill its command when it is told to."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +141,7 @@ async def _wait(process: subprocess.Popen[bytes], output: int, timeout_s: float)
     pidfd = os.pidfd_open(process.pid)
     loop.add_reader(pidfd, ended.set)
     loop.add_reader(output, drain)
+    ending = None
     try:
         await asyncio.wait_for(ended.wait(), timeout_s)
     except asyncio.TimeoutError:
@@ -153,12 +154,21 @@ async def _wait(process: subprocess.Popen[bytes], output: int, timeout_s: float)
             # On request, it kills the command's whole process group; if killed itself, only the command dies
             # with it (PR_SET_PDEATHSIG).
             process.terminate()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(KILL_S)
-            process.kill()
+            ending = in_own_thread(functools.partial(_end, process))
+    if ending is None:
         process.wait()
+    else:
+        await ending
     drain()
     return bytes(kept)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Waits for the helper, which waits for its command: that may not end even when it is killed (state D)."""
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(KILL_S)
+    process.kill()
+    process.wait()
 
 
 def _credentials(pid: int) -> tuple[str, list[str]]:
