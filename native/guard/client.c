@@ -40,7 +40,8 @@ struct avc_guard {
 	const struct avc_heartbeat *heartbeat;
 	uint64_t beats, beats_ns; /* the last ones seen, and when */
 	bool stopping;            /* its exit was requested */
-	bool ended;               /* its socket is at end of file */
+	bool ended;               /* its socket is at end of file, and its pidfd is waited for */
+	uint64_t ended_ns;        /* since when */
 	bool hung;                /* and we have killed it                          */
 	bool mad;                 /* likewise, for an invalid message */
 	int status;               /* of the ended process, as from waitpid(2)       */
@@ -102,18 +103,32 @@ static void queue_event(struct avc_engine *engine, const struct avc_event *event
 	eventfd_write(engine->queue_fd, 1);
 }
 
-/* Reaps it. It may exit a moment after the end of its socket. */
-static void guard_reap(struct avc_guard *guard, uint64_t patience_ns)
+static void guard_kill(const struct avc_guard *guard)
+{
+	syscall(SYS_pidfd_send_signal, guard->pidfd, SIGKILL, NULL, 0);
+}
+
+/* Whether it has exited, and is reaped. */
+static bool guard_reap(struct avc_guard *guard)
+{
+	if (guard->pid && waitpid(guard->pid, &guard->status, WNOHANG) == guard->pid)
+		guard->pid = 0;
+	return !guard->pid;
+}
+
+/* One that waits for a file server that does not answer does not end when it is killed either: it
+ * stays a child of ours. */
+static void guard_end(struct avc_guard *guard, uint64_t patience_ns)
 {
 	struct pollfd ending = { .fd = guard->pidfd, .events = POLLIN };
 
 	if (!guard->pid)
 		return;
-	if (poll_for(&ending, 1, patience_ns) != 1)
-		syscall(SYS_pidfd_send_signal, guard->pidfd, SIGKILL, NULL, 0);
-	while (waitpid(guard->pid, &guard->status, 0) < 0 && errno == EINTR)
-		;
-	guard->pid = 0;
+	if (poll_for(&ending, 1, patience_ns) != 1) {
+		guard_kill(guard);
+		(void)poll_for(&ending, 1, END_NS);
+	}
+	(void)guard_reap(guard);
 }
 
 /* It has exited without a request: the daemon must start another one. */
@@ -126,6 +141,9 @@ static void guard_lost(struct avc_guard *guard)
 	if (guard->mad)
 		fail(&event.error, AVC_PROTOCOL, 0, 0, "", "",
 		     "its guard sent an invalid message and was killed");
+	else if (guard->pid)
+		fail(&event.error, AVC_DEADLINE, 0, 0, "", "",
+		     "its guard was killed and does not end");
 	else if (guard->hung)
 		fail(&event.error, AVC_DEADLINE, 0, 0, "", "",
 		     "its guard gave no sign of life and was killed");
@@ -138,6 +156,19 @@ static void guard_lost(struct avc_guard *guard)
 	queue_event(guard->engine, &event);
 }
 
+static bool guard_wait_for(struct avc_guard *guard, int fd)
+{
+	struct epoll_event on = { .events = EPOLLIN, .data.ptr = guard };
+
+	return epoll_ctl(guard->engine->epoll_fd, EPOLL_CTL_ADD, fd, &on) == 0;
+}
+
+static void guard_wait_no_more(const struct avc_guard *guard)
+{
+	epoll_ctl(guard->engine->epoll_fd, EPOLL_CTL_DEL, guard->socket, NULL);
+	epoll_ctl(guard->engine->epoll_fd, EPOLL_CTL_DEL, guard->pidfd, NULL);
+}
+
 static int guard_spawn(struct avc_guard *guard, struct avc_error *err);
 static void guard_release(struct avc_guard *guard);
 
@@ -148,15 +179,13 @@ static void guard_succeed(struct avc_guard *guard)
 				   .reason = AVC_REASON_FILTER,
 				   .cookie = guard->cookie,
 				   .at_ns = now_ns() };
-	struct epoll_event on = { .events = EPOLLIN, .data.ptr = guard };
 
 	fail(&event.error, AVC_GONE, 0, 0, "", "", "it takes one to suspend the application's own");
 	guard_release(guard);
 	guard->config.suspends = guard->config.late = 1;
 	guard->beats = 0;
 	guard->beats_ns = now_ns();
-	if (guard_spawn(guard, &event.error) == 0 &&
-	    epoll_ctl(guard->engine->epoll_fd, EPOLL_CTL_ADD, guard->socket, &on) == 0)
+	if (guard_spawn(guard, &event.error) == 0 && guard_wait_for(guard, guard->socket))
 		guard->ended = false;
 	else
 		event.reason = AVC_REASON_NONE;
@@ -194,6 +223,17 @@ static ssize_t receive_event(int socket, struct avc_event *event)
 	return n < 0 && errno == ECONNRESET ? recv(socket, event, sizeof *event, flags) : n;
 }
 
+/* Its process has ended, or does not end. */
+static void guard_bury(struct avc_guard *guard)
+{
+	guard_wait_no_more(guard);
+	if (!guard->mad && !guard->hung && !guard->config.suspends && WIFEXITED(guard->status) &&
+	    WEXITSTATUS(guard->status) == AVC_GUARD_HINDERED)
+		guard_succeed(guard);
+	else
+		guard_lost(guard);
+}
+
 /* Queues its events so far, or a part of them: one that never stops sending must not keep us
  * busy. */
 static void guard_listen(struct avc_guard *guard)
@@ -215,15 +255,23 @@ static void guard_listen(struct avc_guard *guard)
 	if (!guard->mad && (n > 0 || (n < 0 && (errno == EAGAIN || errno == EINTR))))
 		return;
 	guard->ended = true;
-	epoll_ctl(guard->engine->epoll_fd, EPOLL_CTL_DEL, guard->socket, NULL);
+	guard->ended_ns = now_ns();
+	guard_wait_no_more(guard);
 	if (guard->stopping && !guard->mad)
 		return;
-	guard_reap(guard, guard->mad ? 0 : END_NS);
-	if (!guard->mad && !guard->hung && !guard->config.suspends && WIFEXITED(guard->status) &&
-	    WEXITSTATUS(guard->status) == AVC_GUARD_HINDERED)
-		guard_succeed(guard);
-	else
-		guard_lost(guard);
+	if (guard->mad)
+		guard_kill(guard);
+	/* It exits a moment later, for which nobody waits here. */
+	if (!guard_wait_for(guard, guard->pidfd))
+		guard_bury(guard);
+}
+
+static void guard_attend(struct avc_guard *guard)
+{
+	if (!guard->ended)
+		guard_listen(guard);
+	else if (guard_reap(guard))
+		guard_bury(guard);
 }
 
 int avc_engine_next_event(struct avc_engine *engine, struct avc_event *event)
@@ -238,7 +286,7 @@ int avc_engine_next_event(struct avc_engine *engine, struct avc_event *event)
 
 		for (int i = 0; i < n; i++)
 			if (ready[i].data.ptr)
-				guard_listen(ready[i].data.ptr);
+				guard_attend(ready[i].data.ptr);
 	}
 	if (engine->count) {
 		*event = engine->queue[engine->first];
@@ -415,13 +463,13 @@ static int guard_spawn(struct avc_guard *guard, struct avc_error *err)
 	fail_errno(err, 0, "start guard", "pidfd_open", "no descriptor");
 	kill(guard->pid, SIGKILL); /* our unreaped child: the PID is still its own */
 	waitpid(guard->pid, NULL, 0);
+	guard->pid = 0;
 	return -1;
 }
 
 struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_config *config,
 				  uint64_t cookie, struct avc_error *err)
 {
-	struct epoll_event on = { .events = EPOLLIN };
 	struct avc_guard *guard;
 
 	*err = (struct avc_error){ 0 };
@@ -444,11 +492,10 @@ struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_co
 		guard_free(guard);
 		return NULL;
 	}
-	on.data.ptr = guard;
 	pthread_mutex_lock(&engine->lock);
 	guard->next = engine->guards;
 	engine->guards = guard;
-	if (epoll_ctl(engine->epoll_fd, EPOLL_CTL_ADD, guard->socket, &on))
+	if (!guard_wait_for(guard, guard->socket))
 		fail_errno(err, 0, "start guard", "epoll_ctl", "its events cannot be waited for");
 	pthread_mutex_unlock(&engine->lock);
 	if (err->code) {
@@ -476,6 +523,20 @@ static bool is_runnable(pid_t pid)
 	return proc_stat(pid, &stat) == 0 && stat.state == 'R';
 }
 
+/* One that has been killed, or has closed its socket, for so long. */
+static void guard_give_up(struct avc_guard *guard, uint64_t patience_ns)
+{
+	const uint64_t since_ns = now_ns() - guard->ended_ns;
+
+	if (since_ns <= END_NS)
+		return;
+	guard_kill(guard);
+	if (since_ns <= END_NS + patience_ns * (is_runnable(guard->pid) ? STARVED_FACTOR : 1))
+		return;
+	guard->ended = guard->stopping = true;
+	guard_bury(guard);
+}
+
 void avc_guard_check(struct avc_guard *guard, uint64_t patience_ns)
 {
 	uint64_t beats, rests_ns, silent_ns;
@@ -493,10 +554,13 @@ void avc_guard_check(struct avc_guard *guard, uint64_t patience_ns)
 		rests_ns = guard->beats_ns + AVC_HEARTBEAT_NS;
 	if (rests_ns > guard->beats_ns)
 		silent_ns = now_ns() > rests_ns ? now_ns() - rests_ns : 0;
-	if (guard->pid && !guard->stopping && silent_ns > patience_ns &&
-	    (!is_runnable(guard->pid) || silent_ns > STARVED_FACTOR * patience_ns)) {
+	if (guard->pid && !guard->stopping && (guard->hung || guard->ended)) {
+		guard_give_up(guard, patience_ns);
+	} else if (guard->pid && !guard->stopping && silent_ns > patience_ns &&
+		   (!is_runnable(guard->pid) || silent_ns > STARVED_FACTOR * patience_ns)) {
 		guard->hung = true;
-		syscall(SYS_pidfd_send_signal, guard->pidfd, SIGKILL, NULL, 0);
+		guard->ended_ns = now_ns();
+		guard_kill(guard);
 	}
 	pthread_mutex_unlock(&guard->engine->lock);
 }
@@ -622,12 +686,11 @@ void avc_guard_stop(struct avc_guard *guard)
 		if (!guard->ended)
 			guard_listen(guard);
 	}
-	if (!guard->ended)
-		epoll_ctl(engine->epoll_fd, EPOLL_CTL_DEL, guard->socket, NULL);
+	guard_wait_no_more(guard);
 	for (at = &engine->guards; *at != guard; at = &(*at)->next)
 		;
 	*at = guard->next;
 	pthread_mutex_unlock(&engine->lock);
-	guard_reap(guard, guard->ended ? END_NS : 0);
+	guard_end(guard, guard->ended ? END_NS : 0);
 	guard_free(guard);
 }

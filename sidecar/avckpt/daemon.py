@@ -18,7 +18,7 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Coroutine, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -571,7 +571,8 @@ class Daemon:
         """It could not do its work, and said why; the next one may succeed."""
         self.caretaker.end(watch)
         self.groups.leave(watch)
-        guard.stop()  # its process has ended
+        # Its process has ended, or was killed and does not end: nobody waits for that.
+        self._begin_task(self._stop(guard))
         watch.guard = None
         watch.container.guard_pid = 0
 
@@ -612,15 +613,22 @@ class Daemon:
             return  # it has begun already
         self.caretaker.end(watch)
         self.groups.leave(watch)
-        task = loop.create_task(self._end(watch))
+        self._begin_task(self._end(watch))
+
+    def _begin_task(self, work: Coroutine[None, None, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
         self._endings.add(task)
         task.add_done_callback(self._endings.discard)
+
+    @staticmethod
+    async def _stop(guard: Guard) -> None:
+        """Blocks for as long as a checkpoint that is under way."""
+        await in_own_thread(guard.stop)
 
     async def _end(self, watch: Watch) -> None:
         container = watch.container
         if watch.guard is not None:
-            # Blocks for as long as a checkpoint that is under way.
-            await in_own_thread(watch.guard.stop)
+            await self._stop(watch.guard)
             self._take_events()  # it may have reported how the container ended
         ended = has_ended(watch.pidfd)
         os.close(watch.pidfd)

@@ -232,7 +232,8 @@ def test_a_command_that_cannot_be_killed_hinders_nobody(local: LocalSidecar, tmp
         try:
             web = protected(local, "web", {**QUICK, "avckpt.notify.self": f"exec:head {tmp_path}/mount/served"})
             crash(local, web)
-            failed, slowest_s = [], 0.0
+            failed: list[dict[str, Any]] = []
+            slowest_s = 0.0
             while not failed:
                 begun = time.monotonic()
                 failed = told(local, "notify_failed")

@@ -13,8 +13,11 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import avckpt.engine
 import pytest
-from avckpt.guard import Command
+from avckpt.engine import Engine
+from avckpt.events.vocabulary import Kind
+from avckpt.guard import Command, Event
 
 from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config, kill_at_random
 from testkit.harness import SLOWNESS, wait_until
@@ -146,3 +149,39 @@ def test_a_final_death_leaves_no_orphan(tmp_path: Path) -> None:
     """The container's init exits only when all of its PID namespace are reaped."""
     for _ in range(5):
         final_death_s(tmp_path, seen=False)
+
+
+def test_nobody_waits_for_a_guard_that_does_not_end(
+    tmp_path: Path, victims_built: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has exited as far as its socket tells, and waits for a file server that has its request."""
+    program = tmp_path / "guard"
+    program.write_text(f"#!/bin/sh\nexec 3>&-\nexec head {tmp_path}/mount/served\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(avckpt.engine, "guard_binary", lambda: program)
+    pidfd = os.pidfd_open(os.getpid())
+    with subprocess.Popen([victims_built / "server", tmp_path, "head"], stdout=subprocess.PIPE) as server:
+        assert server.stdout is not None
+        if server.stdout.readline() != b"ready\n":
+            pytest.skip("/dev/fuse is not available here")
+        try:
+            engine = Engine()
+            guard = engine.start_guard(pidfd, config(), 1)
+            wait_until(lambda: state_of(guard.pid) == "S" and comm_of(guard.pid) == "head", 10, "it waits")
+            events: list[Event] = []
+            longest_s = 0.0
+            begun = time.monotonic()
+            while not events and time.monotonic() < begun + 30:
+                since = time.monotonic()
+                guard.check(0.5)
+                events = [event for event in [engine.next_event()] if event is not None]
+                longest_s = max(longest_s, time.monotonic() - since)
+                time.sleep(0.05)
+            assert [event.kind for event in events] == [Kind.GUARD_LOST]
+            assert "does not end" in str(events[0].error)
+            assert longest_s < 0.5
+            engine.close()
+        finally:
+            server.kill()
+            subprocess.run(["umount", "-l", tmp_path / "mount"], check=True)
+            os.close(pidfd)
