@@ -152,6 +152,35 @@ def test_of_the_host_only_root_registers(local: LocalSidecar, start: Any, tmp_pa
     assert local.ps() == []
 
 
+FLOOD = """
+import os, socket, sys
+os.setgid(65534)
+os.setuid(65534)
+refused = 0
+while refused < 2000:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+        try:
+            connection.connect(sys.argv[1])
+            connection.send(b"nonsense")
+            connection.recv(1000)
+        except ConnectionError:
+            pass
+        refused += 1
+"""
+
+
+@SHARED
+def test_requests_of_anybody_fill_no_log(local: LocalSidecar, start: Any) -> None:
+    """Nor do they keep others out."""
+    for path in (local.run_dir, *local.run_dir.parents):
+        if path.stat().st_uid == 0 and path != Path("/tmp"):
+            path.chmod(path.stat().st_mode | 0o011)
+    subprocess.run([sys.executable, "-c", FLOOD, str(local.run_dir / "units" / "units.sock")], check=True, timeout=60)
+    assert 0 < local.log.count("refused a unit") < 30
+    start("--name", "counter", *QUICK, "--", *COUNT)
+    row(local, "host/counter", state="protected")
+
+
 @SHARED
 def test_a_unit_within_a_unit_is_part_of_it(local: LocalSidecar, start: Any, tmp_path: Path) -> None:
     start("--name", "outer", *QUICK, "--", "sh", "-c", f"{INIT} --name inner -- sleep 1000; exit 3")

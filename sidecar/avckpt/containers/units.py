@@ -17,6 +17,7 @@ import re
 import socket
 import struct
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,6 +43,16 @@ UNITS_MOST = 128
 """Of one container, or of the host."""
 REGISTRATIONS_PER_S = 4.0
 """Further registrations per second after UNITS_MOST at once: each starts a guard."""
+CONNECTIONS_MOST = 1024
+"""Of one user of a PID namespace, at once, ..."""
+CONNECTIONS_PER_S = 16.0
+"""... and further ones; the rest are closed unread."""
+PEERS_MOST = 256
+"""Such users that are remembered."""
+REFUSALS_TOLD = 16
+"""Logged at once; ..."""
+REFUSAL_S = 10.0
+"""... then one in so many seconds: anybody can have a request refused."""
 ANCESTORS_MOST = 64
 HOST = "host"
 """Prefix of a unit's name when it is in no container."""
@@ -217,17 +228,28 @@ def _is_below(path: str, top: str) -> bool:
 class Allowance:
     """How many registrations one container has left.  Times are CLOCK_MONOTONIC seconds."""
 
-    left: float = UNITS_MOST
+    most: float = UNITS_MOST
+    per_s: float = REGISTRATIONS_PER_S
+    left: float = field(init=False)
     at_s: float = field(default_factory=time.monotonic)
+
+    def __post_init__(self) -> None:
+        self.left = self.most
+
+    def has_one(self) -> bool:
+        """Whether there was one, which is taken."""
+        now = time.monotonic()
+        self.left = min(self.left + (now - self.at_s) * self.per_s, self.most)
+        self.at_s = now
+        if self.left < 1:
+            return False
+        self.left -= 1
+        return True
 
     def take(self) -> None:
         """Raises Busy when there are none."""
-        now = time.monotonic()
-        self.left = min(self.left + (now - self.at_s) * REGISTRATIONS_PER_S, UNITS_MOST)
-        self.at_s = now
-        if self.left < 1:
+        if not self.has_one():
             raise Busy("too many units were started in too short a time")
-        self.left -= 1
 
 
 # The socket
@@ -258,6 +280,10 @@ class UnitListener:
         self._loop = asyncio.get_running_loop()
         self._waiting: dict[socket.socket, tuple[asyncio.TimerHandle, int]] = {}
         """And of which PID namespace."""
+        self._peers: OrderedDict[tuple[int, int], Allowance] = OrderedDict()
+        """By PID namespace and user."""
+        self._refusals = Allowance(REFUSALS_TOLD, 1 / REFUSAL_S)
+        self._untold = 0
         self._socket = listen(path)
         self._loop.add_reader(self._socket, self._accept)
 
@@ -282,17 +308,25 @@ class UnitListener:
             return
         connection.setblocking(False)
         try:
-            space = pid_namespace(credentials(connection)[0])
+            pid, uid = credentials(connection)
+            space = pid_namespace(pid)
         except OSError:
             connection.close()
             return
         each = sum(1 for _, other in self._waiting.values() if other == space)
-        if len(self._waiting) >= MAX_WAITING or each >= MAX_WAITING_EACH:
+        if len(self._waiting) >= MAX_WAITING or each >= MAX_WAITING_EACH or not self._may_ask(space, uid):
             connection.close()  # it tries again
             return
         timer = self._loop.call_later(WAIT_S, self._drop, connection)
         self._waiting[connection] = timer, space
         self._loop.add_reader(connection, self._serve, connection)
+
+    def _may_ask(self, space: int, uid: int) -> bool:
+        peer = self._peers.setdefault((space, uid), Allowance(CONNECTIONS_MOST, CONNECTIONS_PER_S))
+        self._peers.move_to_end((space, uid))
+        if len(self._peers) > PEERS_MOST:
+            self._peers.popitem(last=False)
+        return peer.has_one()
 
     def _accept_again(self) -> None:
         if self._socket.fileno() >= 0:
@@ -305,7 +339,15 @@ class UnitListener:
             return  # not readable after all
         self._forget(connection)
         if answer is not None:
-            log.warning("refused a unit: %s", answer.partition(" ")[2])
+            self._tell(answer.partition(" ")[2])
+
+    def _tell(self, refusal: str) -> None:
+        if not self._refusals.has_one():
+            self._untold += 1
+            return
+        more = f" (and {self._untold} others since this was last said)" if self._untold else ""
+        self._untold = 0
+        log.warning("refused a unit: %s%s", refusal, more)
 
     def _drop(self, connection: socket.socket) -> None:
         self._forget(connection)
