@@ -210,7 +210,7 @@ class _Reader:
                 try:
                     parse_policy({label: text})
                 except LabelError as error:
-                    said = shown(text) if text else "an empty value"
+                    said = shown(text, label) if text else "an empty value"
                     self._complain(here, f"{called}.{key}: {said}: {error.why}; {error.allowed}")
         return settings
 
@@ -234,7 +234,9 @@ def _contradictions(defaults: Defaults, root: yaml.Node | None, path: Path) -> I
             node = yamlfile.lookup(names, pattern) if error.key in settings else common
             key = error.key[len(PREFIX) :]
             places = [yamlfile.place_of(found, path) for found, _ in yamlfile.entries(node) if found.value == key]
-            problem = Problem(max(places), f"{key}: {shown(error.value or '')}: {error.why}; {error.allowed}")
+            problem = Problem(
+                max(places), f"{key}: {shown(error.value or '', error.key)}: {error.why}; {error.allowed}"
+            )
             if problem not in seen:
                 seen.add(problem)
                 yield problem

@@ -38,7 +38,7 @@ class LabelError(ValueError):
     """A label that cannot be honoured. The text is one line for users."""
 
     def __init__(self, key: str, value: str | None, why: str, allowed: str) -> None:
-        setting = shown(key) if value is None else f"{shown(key)}={shown(value)}"
+        setting = shown(key) if value is None else f"{shown(key)}={shown(value, key)}"
         super().__init__(f"label {setting}: {why}; {allowed}")
         self.key = key
         self.value = value
@@ -249,7 +249,7 @@ def merge(labels: Mapping[str, str], annotations: Mapping[str, str]) -> dict[str
             raise LabelError(
                 key,
                 merged[key],
-                f"the annotation of the same name says {shown(value)}",
+                f"the annotation of the same name says {shown(value, key)}",
                 "give one of them, or the same value to both",
             )
     return merged
@@ -535,14 +535,14 @@ def _unknown(key: str) -> LabelError:
     return LabelError(key, None, "unknown label", "known are " + ", ".join(sorted(LABELS)))
 
 
-def shown(text: str) -> str:
+def shown(text: str, key: str = "") -> str:
     """A short, printable form of any value.
 
     Of a command only the program: its arguments may be secrets, and messages end
-    up in logs that others read.
+    up in logs that others read. Also where "exec:" was forgotten.
     """
-    if text.startswith("exec:"):
-        program, *arguments = text.split(None, 1)
+    if text.startswith("exec:") or key.startswith(f"{PREFIX}notify"):
+        program, *arguments = text.split(None, 1) or [""]
         text = f"{program} ..." if arguments else program
     printable = "".join(c if c.isprintable() else "?" for c in text)
     printable = printable if len(printable) <= 60 else printable[:57] + "..."
