@@ -61,6 +61,20 @@ def test_a_number_of_a_history_that_was_lost_gets_everything(path: Path) -> None
     assert History(path).add(died()).seq > records[0].seq
 
 
+def test_one_container_takes_half_of_it(path: Path) -> None:
+    """Whatever its nodes are called."""
+    history = History(path, limit=10)
+    others = [history.add(EventRecord(Kind.DIED, container=f"c{i}", at=float(i))) for i in range(8)]
+    for i in range(100):
+        history.add(EventRecord(Kind.REGISTERED, container=f"car/{i}"))
+    assert history.after()[:5] == others[3:]
+    assert [record.container for record in history.after()[5:]] == [f"car/{i}" for i in range(95, 100)]
+    assert History(path, limit=10).after() == history.after()
+    # Others go on to replace the oldest.
+    newer = [history.add(EventRecord(Kind.DIED, container=f"d{i}")) for i in range(10)]
+    assert history.after() == newer
+
+
 def test_it_is_bounded_in_memory_and_in_the_file(path: Path) -> None:
     history = History(path, limit=10)
     longest = 0

@@ -9,7 +9,7 @@ import signal
 
 import pytest
 from avckpt.errors import AvckptError, DeadlineMissed, KernelError, Unsupported
-from avckpt.events.journal import SELDOM_S, Journal
+from avckpt.events.journal import OFTEN_AT_ONCE, OFTEN_S, SELDOM_S, Journal
 from avckpt.events.record import EventRecord, of_guard
 from avckpt.events.vocabulary import Kind, Reason
 from avckpt.guard import Event
@@ -47,6 +47,27 @@ def test_missed_checkpoints_are_counted_not_repeated() -> None:
     later = journal.line(missed(100.0 + SELDOM_S))
     assert later is not None
     assert later[1].endswith("(and 2 more since this was last said)")
+
+
+def test_what_an_application_brings_about_at_will_has_an_end() -> None:
+    """It executes another program after each checkpoint, or is refused for another reason each time."""
+    journal = Journal()
+    told = []
+    for i in range(1000):
+        at_ns = int((100 + i / 10) * 1e9)
+        for record in (
+            dataclasses.replace(checkpoint(i), monotonic_s=at_ns / 1e9),
+            of_guard(Event(Kind.DROPPED, 1, at_ns=at_ns, generation=i, reason=Reason.EXECUTED)),
+            dataclasses.replace(unprotected(f"reason {i}"), monotonic_s=at_ns / 1e9),
+        ):
+            line = journal.line(record)
+            if line is not None and line[0] >= logging.INFO:
+                told.append(line[1])
+    assert OFTEN_AT_ONCE <= len(told) <= OFTEN_AT_ONCE + 100 / OFTEN_S + 1
+    assert "more lines of that kind before)" in told[-1]
+    # What it dies of is told all the same.
+    assert journal.line(of_guard(Event(Kind.DIED, 1, wait_status=9))) is not None
+    assert journal.line(of_guard(Event(Kind.DROPPED, 1, generation=1, reason=Reason.CRASHED))) is not None
 
 
 def test_a_miss_that_cost_what_was_held_is_told_at_once_and_so_is_the_next_checkpoint() -> None:

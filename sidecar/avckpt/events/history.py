@@ -14,7 +14,7 @@ import json
 import logging
 import os
 import time
-from collections import deque
+from collections import Counter, deque
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,6 +34,7 @@ AGAIN_S = 10.0
 class History:
     """The last events of a machine: since it started, or with an `archive` from before; at most `limit`.
 
+    At most half of it is of one container, whose events may come as often as it likes.
     For one thread.  What cannot be written is kept in memory until it can, and the log says so once.
     A `durable` one waits for its disk before it replaces the file.
     """
@@ -45,7 +46,9 @@ class History:
         self._limit = limit
         self._archive = archive
         self._durable = durable
-        self._kept: deque[EventRecord] = deque(maxlen=limit)
+        self._kept: deque[EventRecord] = deque()
+        self._shares: Counter[str] = Counter()
+        """How many are kept of each container, its nodes' included."""
         self._lines = 0
         self._fd = -1
         self._closed = False
@@ -72,7 +75,7 @@ class History:
     def keep(self, record: EventRecord) -> None:
         """Keeps an event that has its number."""
         self._next = record.seq + 1
-        self._kept.append(record)
+        self._hold(record)
         if self._failed_s is None and self._lines < 2 * self._limit:
             self._append(record)
         elif self._failed_s is None or time.monotonic() - self._failed_s >= AGAIN_S:
@@ -111,7 +114,10 @@ class History:
         for seq in sorted(here.keys() - there.keys()):
             archive.add(here[seq])
         both = {**there, **here}
-        self._kept = deque((both[seq] for seq in sorted(both)), maxlen=self._limit)
+        self._kept.clear()
+        self._shares.clear()
+        for seq in sorted(both):
+            self._hold(both[seq])
         return bool(there.keys() - here.keys())
 
     def _load(self) -> bool:
@@ -133,9 +139,22 @@ class History:
                 whole = False
                 continue
             if record.seq > last:
-                self._kept.append(record)
+                self._hold(record)
                 last = record.seq
         return whole
+
+    def _hold(self, record: EventRecord) -> None:
+        whose = _whose(record)
+        self._kept.append(record)
+        self._shares[whose] += 1
+        if len(self._kept) <= self._limit:
+            return
+        if self._shares[whose] <= self._limit // 2:
+            whose = _whose(self._kept[0])
+        del self._kept[next(i for i, each in enumerate(self._kept) if _whose(each) == whose)]
+        self._shares[whose] -= 1
+        if not self._shares[whose]:
+            del self._shares[whose]
 
     def _append(self, record: EventRecord) -> None:
         if self._closed:
@@ -184,6 +203,11 @@ class History:
         if self._failed_s is None:
             log.error("%s cannot be used (%s): events are kept in memory only", self._path, error.strerror)
         self._failed_s = time.monotonic()
+
+
+def _whose(record: EventRecord) -> str:
+    """Nodes are called CONTAINER/NODE, and may be others every second."""
+    return record.container.partition("/")[0]
 
 
 def _line(record: EventRecord) -> bytes:

@@ -12,6 +12,11 @@ SELDOM_S = 60.0
 """Failures that may recur at every interval (a checkpoint, a health check) are logged at most this often per
 container."""
 
+OFTEN_AT_ONCE = 30
+OFTEN_S = 10.0
+"""What an application can bring about as often as it likes (it executes programs, it cannot be protected for
+changing reasons) is logged so many times at once, and then once in this time."""
+
 LEVELS = {
     Kind.REGISTERED: logging.INFO,
     Kind.ATTACHED: logging.DEBUG,
@@ -53,6 +58,26 @@ class _Seldom:
         return logging.WARNING, f"{record.message}{more}"
 
 
+class _Often:
+    """Lets so many lines through at once, and then one per `OFTEN_S`; the others are counted."""
+
+    def __init__(self) -> None:
+        self._left = float(OFTEN_AT_ONCE)
+        self._at_s = 0.0
+        self._untold = 0
+
+    def line(self, at_s: float, line: tuple[int, str]) -> tuple[int, str] | None:
+        self._left = min(self._left + (at_s - self._at_s) / OFTEN_S, OFTEN_AT_ONCE)
+        self._at_s = at_s
+        if self._left < 1:
+            self._untold += 1
+            return None
+        self._left -= 1
+        more = f" (and {self._untold} more lines of that kind before)" if self._untold else ""
+        self._untold = 0
+        return line[0], line[1] + more
+
+
 class Journal:
     """Makes the log lines of one container. Remembers what it has logged, so that nothing is repeated at
     every interval."""
@@ -63,9 +88,19 @@ class Journal:
         self._lacking = ""
         self._missed = _Seldom()
         self._unhealthy = _Seldom()
+        self._often = _Often()
 
     def line(self, record: EventRecord) -> tuple[int, str] | None:
         """A logging level and the text (without the container's name), or None for silence."""
+        line = self._line(record)
+        often = record.kind in (Kind.CHECKPOINT, Kind.UNPROTECTED) or (
+            record.kind is Kind.DROPPED and record.reason not in (Reason.CRASHED, Reason.UNHEALTHY)
+        )
+        if line is None or not often or line[0] < logging.INFO:
+            return line
+        return self._often.line(record.monotonic_s, line)
+
+    def _line(self, record: EventRecord) -> tuple[int, str] | None:
         kind = record.kind
         if kind is Kind.CHECKPOINT:
             return self._checkpoint(record)
