@@ -9,6 +9,8 @@ import signal
 import socket
 import subprocess
 import tempfile
+import subprocess
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -225,6 +227,24 @@ def test_strict_sees_files_that_are_not_open(how: str, why: str, tmp_path: Path,
         else:
             guard.wait("restored", since=since)
             victim.wait_beats()
+
+
+@pytest.mark.parametrize("name", ["developer", "system", "processed"])
+def test_a_volume_whose_name_begins_like_that_of_devices(name: str, memory: Path) -> None:
+    with tempfile.TemporaryDirectory(prefix=f"{name}-", dir="/") as folder:
+        subprocess.run(["mount", "-t", "tmpfs", "avckpt-test", folder], check=True)
+        try:
+            with (
+                Victim(f"scribe closed {folder}/data", memory) as victim,
+                GuardProcess(config(files=Files.STRICT), [victim.pid]) as guard,
+            ):
+                checkpoint(guard)
+                victim.kill_app(signal.SIGUSR1)
+                wait_until(lambda: victim.see().counter[0] == 1, 10, "it has done it")
+                victim.kill_app()
+                assert "was written since the checkpoint" in str(guard.wait("gave_up")["error"])
+        finally:
+            subprocess.run(["umount", "-l", folder], check=True)
 
 
 class Client:

@@ -45,23 +45,31 @@ void files_written_free(struct files_written *written)
 	free(written);
 }
 
-static bool starts_with_one_of(const char *text, const char *const *words)
+static bool is_one_of(const char *text, const char *const *words)
 {
 	for (; *words; words++)
-		if (!strncmp(text, *words, strlen(*words)))
+		if (!strcmp(text, *words))
 			return true;
 	return false;
+}
+
+static bool is_at_or_below(const char *point, const char *place)
+{
+	const size_t length = strlen(place);
+
+	return !strncmp(point, place, length) && (!point[length] || point[length] == '/');
 }
 
 /* Without data, or where opening a file has side effects (devices) or may wait for a server. */
 static bool is_worth_it(const char *point, const char *options, const char *type)
 {
-	static const char *const places[] = { "/dev", "/proc", "/sys", NULL };
-	static const char *const types[] = { "proc",   "sysfs",   "cgroup",  "devpts", "devtmpfs",
-					     "mqueue", "tracefs", "debugfs", "bpf",    NULL };
+	static const char *const types[] = { "proc",     "sysfs",  "cgroup",  "cgroup2",
+					     "devpts",   "mqueue", "tracefs", "debugfs",
+					     "devtmpfs", "bpf",    NULL };
 
-	return strncmp(options, "ro", 2) && !starts_with_one_of(point, places) &&
-	       !starts_with_one_of(type, types) && !mount_is_served(type);
+	return strncmp(options, "ro", 2) && !is_at_or_below(point, "/dev") &&
+	       !is_at_or_below(point, "/proc") && !is_at_or_below(point, "/sys") &&
+	       !is_one_of(type, types) && !mount_is_served(type);
 }
 
 #define TRIES 3 /* a rename elsewhere may come in between */
