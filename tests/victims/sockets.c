@@ -4,10 +4,12 @@
  *
  *   sockets SCENARIO FOLDER     see scenario.h
  */
+#include <grp.h>
 #include <poll.h>
 #include <sys/epoll.h>
 #include <sys/resource.h>
 #include <sys/socket.h>
+#include <sys/stat.h>
 #include <sys/syscall.h>
 
 #include "scenario.h"
@@ -405,6 +407,44 @@ static void child_verify(void)
 	watch_child();
 }
 
+/* ---- who made them -------------------------------------------------------------------- */
+
+enum { NOBODY = 65534 };
+
+static void user_setup(void)
+{
+	must(!setgroups(0, NULL) && !setresgid(NOBODY, NOBODY, NOBODY) &&
+		     !setresuid(NOBODY, NOBODY, NOBODY),
+	     "setresuid");
+	must(socketpair(AF_UNIX, SOCK_STREAM, 0, fd) == 0 &&
+		     socketpair(AF_UNIX, SOCK_SEQPACKET, 0, fd + 2) == 0 &&
+		     socketpair(AF_UNIX, SOCK_STREAM, 0, fd + 4) == 0 && pipe(fd + 6) == 0,
+	     "socketpair");
+	close(fd[5]);
+}
+
+static void user_disturb(void)
+{
+	for (int i = 0; i < 8; i++)
+		close(fd[i]);
+}
+
+static void user_verify(void)
+{
+	struct stat st;
+
+	for (int i = 0; i < 5; i++) {
+		struct ucred peer = { 0 };
+		socklen_t bytes = sizeof peer;
+
+		CHECK(getsockopt(fd[i], SOL_SOCKET, SO_PEERCRED, &peer, &bytes) == 0 &&
+			      peer.uid == NOBODY && peer.gid == NOBODY,
+		      "socket %d is of user %d", i, (int)peer.uid);
+	}
+	CHECK(fstat(fd[6], &st) == 0 && st.st_uid == NOBODY, "a pipe is of user %d",
+	      (int)st.st_uid);
+}
+
 static const struct scenario scenarios[] = {
 	{ "messages", messages_setup, messages_disturb, messages_verify },
 	{ "child", child_setup, child_disturb, child_verify },
@@ -413,6 +453,7 @@ static const struct scenario scenarios[] = {
 	{ "rights", rights_setup, rights_disturb, nothing },
 	{ "flight", flight_setup, nothing, flight_verify },
 	{ "shut", shut_setup, shut_disturb, shut_verify },
+	{ "user", user_setup, user_disturb, user_verify },
 };
 
 int main(int argc, char **argv)

@@ -557,6 +557,9 @@ void file_rights_note(struct file_rights *rights, pid_t pid, const struct proc_s
  * done in between. -1: it cannot, and nothing has changed. */
 int file_rights_take(const struct file_rights *rights, struct file_rights_own *own) warn_unused;
 void file_rights_give_back(const struct file_rights_own *own);
+/* socketpair(2) of a type, or pipe2(2) for 0, as that process would call it: the kernel tells
+ * whoever has one of these sockets who did (unix(7), SO_PEERCRED). */
+int file_rights_pair(const struct file_rights *rights, int type, int ends[2]) warn_unused;
 
 /* files_make.c */
 /* The slave side of a pseudoterminal. */
@@ -572,7 +575,8 @@ int file_find(const struct file *want, pid_t template, pid_t init);
 int file_make(const struct file *want, pid_t template, pid_t init, const struct file_rights *rights,
 	      const char **why);
 /* Both ends of a pipe or socket pair; of a pipe the one to read from comes first. */
-int file_make_pair(const struct file *want, const struct file *other, int ends[2]);
+int file_make_pair(const struct file *want, const struct file *other,
+		   const struct file_rights *rights, int ends[2]);
 
 /* files_restore.c and files_calls.c */
 /* One restore of a table: from `now` to `want`. */

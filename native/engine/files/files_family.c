@@ -344,7 +344,7 @@ static void join_lost(const struct tables *tables, struct files_work *work, cons
 		return;
 	}
 	other = find_other(tables, w, &made_already);
-	if (!other || made_already || file_make_pair(w, other, ends))
+	if (!other || made_already || file_make_pair(w, other, &work->want->rights, ends))
 		return;
 	/* pipe(2): the first is the one to read from. */
 	writer = w->kind == FILE_PIPE && (w->flags & O_ACCMODE) == O_WRONLY;
@@ -495,7 +495,8 @@ static bool is_blocked(const struct tables *tables, const struct file *w, int is
 
 /* shutdown(2) cannot be undone: such a pair is recreated, and shut down after its contents have
  * been restored. */
-static void renew_pair(const struct tables *tables, const struct file *w, const struct file *other)
+static void renew_pair(const struct tables *tables, const struct file *w, const struct file *other,
+		       const struct file_rights *rights)
 {
 	const int is = shut_now(tables, w), others = shut_now(tables, other);
 	int ends[2];
@@ -505,7 +506,7 @@ static void renew_pair(const struct tables *tables, const struct file *w, const 
 	if (!(is & ~shut_of(w, other)) && !(others & ~shut_of(other, w)) &&
 	    !is_blocked(tables, w, is, others) && !is_blocked(tables, other, others, is))
 		return;
-	if (file_make_pair(w, other, ends))
+	if (file_make_pair(w, other, rights, ends))
 		return;
 	give_end(tables, w, ends[0]);
 	give_end(tables, other, ends[1]);
@@ -535,7 +536,7 @@ static void see_to_pairs(const struct tables *tables, bool renew)
 			if (!other || !other->socket)
 				continue;
 			if (renew)
-				renew_pair(tables, w, other);
+				renew_pair(tables, w, other, &tables->work[i].want->rights);
 			else
 				shut_end(tables, w, shut_of(w, other));
 		}

@@ -186,7 +186,7 @@ static void leave_content(int fd, int other_fd, const struct file *want)
 }
 
 /* A socket or pipe that reads as closed by the peer, after its contents. */
-static int make_dead(const struct file *want, pid_t template)
+static int make_dead(const struct file *want, pid_t template, const struct file_rights *rights)
 {
 	const struct file_socket *s = want->socket;
 	int ends[2], fd;
@@ -194,7 +194,7 @@ static int make_dead(const struct file *want, pid_t template)
 	if (want->kind == FILE_PIPE) {
 		const int mine = (want->flags & O_ACCMODE) == O_RDONLY ? 0 : 1;
 
-		if (pipe2(ends, O_CLOEXEC))
+		if (file_rights_pair(rights, 0, ends))
 			return -1;
 		if (mine == 0)
 			leave_content(ends[0], ends[1], want);
@@ -208,10 +208,8 @@ static int make_dead(const struct file *want, pid_t template)
 			return fd;
 		}
 	}
-	if (socketpair(AF_UNIX,
-		       (s && s->type == SOCK_SEQPACKET ? SOCK_SEQPACKET : SOCK_STREAM) |
-			       SOCK_CLOEXEC,
-		       0, ends))
+	if (file_rights_pair(rights, s && s->type == SOCK_SEQPACKET ? SOCK_SEQPACKET : SOCK_STREAM,
+			     ends))
 		return -1;
 	leave_content(ends[0], ends[1], want);
 	close(ends[1]);
@@ -240,7 +238,8 @@ static int bind_socket(int fd, const struct file_socket *s, const char **why)
 /* Those that need no peer.  For a Unix socket, listen(2) is left to the restored process, which
  * clients see as the server (unix(7), SO_PEERCRED), and connect(2) until all have their names
  * (files_restore.c). */
-static int make_socket(const struct file *want, pid_t template, pid_t init, const char **why)
+static int make_socket(const struct file *want, pid_t template, pid_t init,
+		       const struct file_rights *rights, const char **why)
 {
 	const struct file_socket *s = want->socket;
 	const char *problem;
@@ -250,11 +249,11 @@ static int make_socket(const struct file *want, pid_t template, pid_t init, cons
 		/* A closed connection need not be reported. */
 		if (s && s->domain != AF_UNIX && s->domain != AF_INET && s->domain != AF_INET6)
 			*why = not_again;
-		return make_dead(want, template);
+		return make_dead(want, template, rights);
 	}
 	fd = socket_of(template, s->domain, s->type, s->protocol);
 	if (fd < 0)
-		return make_dead(want, template);
+		return make_dead(want, template, rights);
 	/* Only sockets of one user can share a port (socket(7), SO_REUSEPORT). */
 	if (fchown(fd, s->uid, s->gid))
 		*why = "it does not belong to its user any more";
@@ -262,7 +261,7 @@ static int make_socket(const struct file *want, pid_t template, pid_t init, cons
 	if (s->domain == AF_UNIX ? file_bind_unix(fd, s, template, init, why)
 				 : bind_socket(fd, s, why)) {
 		close(fd);
-		return make_dead(want, template);
+		return make_dead(want, template, rights);
 	}
 	problem = file_put_options(fd, s); /* one was in the way of bind(2) */
 	*why = *why ? *why : problem;
@@ -319,10 +318,10 @@ int file_make(const struct file *want, pid_t template, pid_t init, const struct 
 		return fd >= 0 ? fd : make_named(want, template, init, rights, why);
 	case FILE_PIPE:
 		fd = take_from_init(want, init);
-		return fd >= 0 ? fd : make_dead(want, template);
+		return fd >= 0 ? fd : make_dead(want, template, rights);
 	case FILE_SOCKET:
 		fd = take_from_init(want, init);
-		return fd >= 0 ? fd : make_socket(want, template, init, why);
+		return fd >= 0 ? fd : make_socket(want, template, init, rights, why);
 	case FILE_EVENTFD:
 		return eventfd(0, EFD_CLOEXEC | (nonblock ? EFD_NONBLOCK : 0) |
 					  (want->semaphore ? EFD_SEMAPHORE : 0));
@@ -347,17 +346,16 @@ int file_make(const struct file *want, pid_t template, pid_t init, const struct 
 	return open_empty(want);
 }
 
-int file_make_pair(const struct file *want, const struct file *other, int ends[2])
+int file_make_pair(const struct file *want, const struct file *other,
+		   const struct file_rights *rights, int ends[2])
 {
+	if (file_rights_pair(rights, want->kind == FILE_PIPE ? 0 : want->socket->type, ends))
+		return -1;
 	if (want->kind == FILE_PIPE) {
-		if (pipe2(ends, O_CLOEXEC))
-			return -1;
 		if (want->pipe_bytes > 0 && want->pipe_bytes != fcntl(ends[0], F_GETPIPE_SZ))
 			(void)fcntl(ends[0], F_SETPIPE_SZ, want->pipe_bytes);
 		return 0;
 	}
-	if (socketpair(AF_UNIX, want->socket->type | SOCK_CLOEXEC, 0, ends))
-		return -1;
 	file_put_options(ends[0], want->socket);
 	file_put_options(ends[1], other->socket);
 	return 0;

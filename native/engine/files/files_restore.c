@@ -231,7 +231,7 @@ static void make_pair(struct files_work *work, const struct file *w)
 	a = files_leader(work->want, w);
 	b = files_leader(work->want, other);
 	if (a == b || work->local[a] >= 0 || work->local[b] >= 0 || work->source[a] >= 0 ||
-	    work->source[b] >= 0 || file_make_pair(w, other, ends))
+	    work->source[b] >= 0 || file_make_pair(w, other, &work->want->rights, ends))
 		return;
 	work->local[a] = ends[0];
 	work->local[b] = ends[1];

@@ -4,9 +4,12 @@
  * capabilities.  That it had them open once is not enough: the mode may have been changed since, or
  * another file may have reused the inode number.
  */
+#include <errno.h>
+#include <fcntl.h>
 #include <grp.h>
 #include <linux/capability.h>
 #include <string.h>
+#include <sys/socket.h>
 #include <sys/syscall.h>
 #include <unistd.h>
 
@@ -81,4 +84,38 @@ void file_rights_give_back(const struct file_rights_own *own)
 	set_user(own->user, own->group);
 	(void)set_effective(~UINT64_C(0));
 	(void)syscall(SYS_setgroups, own->group_count, own->groups);
+}
+
+static void set_effective_user(uint32_t user, uint32_t group)
+{
+	syscall(SYS_setresgid, -1, group, -1);
+	syscall(SYS_setresuid, -1, user, -1);
+}
+
+static bool is_effective_user(uint32_t user, uint32_t group)
+{
+	return (uint32_t)syscall(SYS_geteuid) == user && (uint32_t)syscall(SYS_getegid) == group;
+}
+
+int file_rights_pair(const struct file_rights *rights, int type, int ends[2])
+{
+	struct file_rights_own own = { .user = (uint32_t)syscall(SYS_geteuid),
+				       .group = (uint32_t)syscall(SYS_getegid) };
+	int result = -1;
+
+	own.group_count = (int)syscall(SYS_getgroups, RIGHTS_GROUPS, own.groups);
+	if (!rights->known || own.group_count < 0 ||
+	    syscall(SYS_setgroups, rights->group_count, rights->groups))
+		return -1;
+	set_effective_user(rights->user, rights->group);
+	if (!is_effective_user(rights->user, rights->group))
+		errno = EPERM;
+	else
+		result = type ? socketpair(AF_UNIX, type | SOCK_CLOEXEC, 0, ends)
+			      : pipe2(ends, O_CLOEXEC);
+	/* The real user is still our own, and our capabilities come back with it. */
+	syscall(SYS_setresuid, -1, own.user, -1);
+	syscall(SYS_setresgid, -1, own.group, -1);
+	(void)syscall(SYS_setgroups, own.group_count, own.groups);
+	return result;
 }
