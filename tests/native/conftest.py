@@ -42,3 +42,17 @@ def memory() -> Iterator[Path]:
     """A folder for the board; on a disk its writable mapping would count as data."""
     with tempfile.TemporaryDirectory(dir="/dev/shm") as path:
         yield Path(path)
+
+
+@pytest.fixture
+def huge_pages() -> Iterator[None]:
+    """Adds a few pages to the machine's pool for the length of a test."""
+    pool = Path("/proc/sys/vm/nr_hugepages")
+    before = int(pool.read_text())
+    pool.write_text(str(before + 8))
+    try:
+        if int(pool.read_text()) < before + 8:
+            pytest.skip("the kernel finds no 8 huge pages")
+        yield
+    finally:
+        pool.write_text(str(before))

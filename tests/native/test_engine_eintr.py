@@ -10,13 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from testkit.guarded import GuardProcess, Victim, config
+from testkit.guarded import WHERE, GuardProcess, Victim, config
 from testkit.harness import SLOWNESS
 
 pytestmark = pytest.mark.shared_machine("timeouts of blocked calls are compared with the clock")
 
 CHECKPOINTS = 10_000 if os.environ.get("AVCKPT_LONG") == "1" else 500
 ROUSING = 1_000
+HUGE_PAGES = 8
 LONGEST, PUNCTUAL = 3, 7
 KINDS_AT = 8
 KINDS, TIMED = 43, 33
@@ -61,6 +62,16 @@ def test_a_signal_ends_a_call_whenever_it_comes(tmp_path: Path) -> None:
         victim.wait_beats(20)
         victim.check()
         assert min(ended) > ROUSING // 20, ended
+
+
+@pytest.mark.usefixtures("huge_pages")
+@pytest.mark.parametrize("where", WHERE)
+def test_a_file_gets_its_room(where: str, tmp_path: Path) -> None:
+    """fallocate(2) of huge pages waits for nobody, but looks for signals."""
+    command = f"grows {HUGE_PAGES * 2048} {where}"
+    with Victim(command, tmp_path) as victim, GuardProcess(config(keep=1), [victim.pid]) as guard:
+        assert guard.burst(200)["taken"] > 0
+        victim.wait_beats(3)
 
 
 @pytest.mark.parametrize("under", UNDER)

@@ -258,20 +258,6 @@ def test_what_others_have_open_for_writing_is_theirs_and_told(visible: Path, tmp
         assert "shared memory are also others'" in guard.checkpoint()["error"]["message"]
 
 
-@pytest.fixture
-def huge_pages() -> Iterator[None]:
-    """Adds a few pages to the machine's pool for the length of a test."""
-    pool = Path("/proc/sys/vm/nr_hugepages")
-    before = int(pool.read_text())
-    pool.write_text(str(before + 8))
-    try:
-        if int(pool.read_text()) < before + 8:
-            pytest.skip("the kernel finds no 8 huge pages")
-        yield
-    finally:
-        pool.write_text(str(before))
-
-
 @pytest.mark.usefixtures("huge_pages")
 def test_shared_huge_pages_are_rolled_back(tmp_path: Path) -> None:
     with Victim("mappings 2048 --huge", tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:

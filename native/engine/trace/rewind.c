@@ -40,6 +40,7 @@
 #include "trace.h"
 
 #define DATE_LOOKS 5 /* attempts to read the clock of a busy CPU */
+#define PATIENCE_NS (60 * NS_PER_S)
 #define FDS_PER_WORD 64
 #define FD_WORDS_MAX 16384 /* of an fd_set: a million descriptors */
 
@@ -50,7 +51,7 @@
 #define SYS_poll SYS_ppoll
 #endif
 
-enum timeout { NO_TIMEOUT, MILLISECONDS, TIMESPEC, TIMEVAL, RECEIVE, SEND, SLEEP, FUTEX };
+enum timeout { NO_TIMEOUT, MILLISECONDS, TIMESPEC, TIMEVAL, RECEIVE, SEND, SLEEP, FUTEX, PATIENCE };
 
 /* Calls that return EINTR after a stop, have had no effect when they do, and may be repeated.
  * Never close(2). */
@@ -64,6 +65,9 @@ static const struct rewindable {
 	{ SYS_epoll_pwait, MILLISECONDS, 3, 0 },
 	{ SYS_epoll_pwait2, TIMESPEC, 3, 0 },
 	{ SYS_semop, NO_TIMEOUT, 0, 0 },
+	/* On huge pages, where it goes on from where it was; before Linux 6.18 also on tmpfs, where it
+	 * begins anew, and would not end if it takes longer than the time between two checkpoints. */
+	{ SYS_fallocate, PATIENCE, 0, -EINTR },
 	{ SYS_semtimedop, TIMESPEC, 3, -EAGAIN },
 	{ SYS_rt_sigtimedwait, TIMESPEC, 2, -EAGAIN },
 	{ SYS_io_getevents, TIMESPEC, 4, 0 },
@@ -175,6 +179,8 @@ static uint64_t time_of_call(const struct process *process, const struct arch_re
 		return (arch_syscall_arg(regs, 1) & FUTEX_CMD_MASK) == FUTEX_WAIT
 			       ? time_in_memory(process, argument, 1)
 			       : 0;
+	case PATIENCE:
+		return PATIENCE_NS;
 	case NO_TIMEOUT:
 		break;
 	}
