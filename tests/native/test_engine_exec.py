@@ -6,12 +6,14 @@ The kernel ends all other threads first, and gives it the number of the main one
 
 from __future__ import annotations
 
+import shutil
+import signal
 import time
 from pathlib import Path
 
 import pytest
 
-from testkit.guarded import WHERE, GuardProcess, Victim, config
+from testkit.guarded import BUILD, WHERE, GuardProcess, Victim, config
 from testkit.harness import SLOWNESS, wait_until
 
 PROGRAMS = 300
@@ -60,3 +62,17 @@ def test_it_runs_on_under_its_new_number(where: str, tmp_path: Path) -> None:
     with Victim(f"reexec 100 4 --slow {where}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for _ in range(SLOW_PROGRAMS):
             be_late(victim, guard)
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_a_program_with_more_privileges_gets_them(where: str, tmp_path: Path) -> None:
+    """The kernel refuses them to a process whose directories others share."""
+    copy = tmp_path / "copy"
+    shutil.copyfile(BUILD / "rises", copy)
+    copy.chmod(0o4755)
+    with Victim(f"rises {copy} {where}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        for _ in range(2):
+            assert guard.checkpoint()["kind"] == "checkpoint"
+        victim.kill_app(signal.SIGUSR1)
+        wait_until(lambda: "effectively" in victim.said, SOON_S, "another program")
+        assert "effectively 0" in victim.said

@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from avckpt.guard import Images
 
 from testkit.guarded import BUILD, WHERE, GuardProcess, Victim, config, kill_at_random
 from testkit.harness import wait_until
@@ -34,6 +35,17 @@ def test_traits(kind: str, where: str, tmp_path: Path) -> None:
     """Of children: exit signals, the group of an ended one, limits; membarrier(2)."""
     with Victim(f"traits {kind} {where}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 10, (0.01, 0.12))
+
+
+@pytest.mark.parametrize("images", list(Images))
+@pytest.mark.parametrize("where", WHERE)
+def test_where_it_is(where: str, images: Images, tmp_path: Path) -> None:
+    """Directory and umask change all the time, also between a look at them and the freeze."""
+    with (
+        Victim(f"wanders {where}", tmp_path) as victim,
+        GuardProcess(config(0.01, images=images), [victim.pid]) as guard,
+    ):
+        kill_at_random(guard, victim, 15, (0.0, 0.1))
 
 
 def test_thousands_of_groups(tmp_path: Path) -> None:

@@ -359,9 +359,11 @@ static int begin(struct process *process, uint32_t slot, uint64_t takes_ns, stru
 		return -1;
 	if (!process->descendant && !process->recycling)
 		return freeze_start_clone(process, slot, err);
-	return thread_vet(process, thread, err) ||
-			       (!process->recycling && process->holder &&
-				freeze_start_clone(process, slot, err)) ||
+	if (thread_vet(process, thread, err))
+		return -1;
+	if (!process->recycling && process_has_moved(process, thread->umask))
+		process_unhold(process); /* gets another one (clone_missing()) */
+	return (!process->recycling && process->holder && freeze_start_clone(process, slot, err)) ||
 			       ask_begin(process, slot, takes_ns, err)
 		       ? -1
 		       : 0;

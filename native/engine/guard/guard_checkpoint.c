@@ -175,7 +175,7 @@ static int prepare_process(struct avc_guard *guard, uint32_t entry, uint32_t *la
 			return -1;
 	}
 	/* Its holder makes calls from memory that the process can write. */
-	if (process->holder && has_filters_since(process))
+	if ((process->holder && has_filters_since(process)) || process_has_moved(process, -1))
 		process_unhold(process);
 	/* That of the main process is what its threads are asked about (fence.c). */
 	if (!process->descendant && !process->holder && hold(guard, process, err))

@@ -274,16 +274,14 @@ static void lose_program(struct avc_guard *guard)
 	guard->main.infected = false; /* the parasite went with its memory */
 }
 
-/* unshare(2) and close_range(2) (CLOSE_RANGE_UNSHARE) leave a table, or a directory, to whoever
- * shares it, and change nothing where nobody does: what the process closes from then on would stay
- * open in its holder and templates.  A task that is exiting has neither, and one whose core is
- * being written has a table of its own (fs/coredump.c, do_coredump()). */
+/* unshare(2) and close_range(2) (CLOSE_RANGE_UNSHARE) leave a table to whoever shares it, and change
+ * nothing where nobody does: what the process closes from then on would stay open in its holder and
+ * templates.  A task that is exiting has none, and one whose core is being written has one of its own
+ * (fs/coredump.c, do_coredump()). */
 static bool has_left_holder(const struct process *process)
 {
 	return process->pid && process->holder &&
-	       (proc_shares(process->pid, process->holder, SHARED_FILES) == 0 ||
-		(process->descendant &&
-		 proc_shares(process->pid, process->holder, SHARED_FOLDERS) == 0)) &&
+	       proc_shares(process->pid, process->holder, SHARED_FILES) == 0 &&
 	       !proc_is_exiting(process->pid) && !pidfd_ended(process->pidfd) &&
 	       !proc_is_dying(process->stat_fd) && !proc_is_exiting(process->holder);
 }

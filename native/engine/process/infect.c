@@ -825,6 +825,37 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	return keep_holder(process, holder, result, err);
 }
 
+/* What cannot be found out is 0.  umask -1: not known yet. */
+static struct folders folders_of(const struct process *process, int32_t umask)
+{
+	static const char *const name[] = { "root", "cwd" };
+	struct folders folders = { .umask = (uint64_t)umask };
+	struct proc_status status;
+	struct statx st;
+
+	if (umask < 0)
+		folders.umask = proc_status_of(process->status_fd, process->pid, &status) == 0
+					? status.umask
+					: 0;
+	for (size_t i = 0; i < sizeof name / sizeof *name; i++)
+		if (proc_look(process->pid, name[i], STATX_INO | STATX_MNT_ID, &st)) {
+			folders.device[i] = device_of(&st);
+			folders.inode[i] = st.stx_ino;
+			folders.mount[i] = st.stx_mnt_id;
+		}
+	return folders;
+}
+
+bool process_has_moved(const struct process *process, int32_t umask)
+{
+	struct folders now;
+
+	if (!process->descendant || !process->holder)
+		return false;
+	now = folders_of(process, umask);
+	return memcmp(&now, &process->folders, sizeof now) != 0;
+}
+
 /* The stopped intermediate task clones the holder, which is then in its first stop. */
 static int clone_holder(struct process *process, pid_t between, pid_t *holder,
 			struct avc_error *err)
@@ -832,7 +863,7 @@ static int clone_holder(struct process *process, pid_t between, pid_t *holder,
 	struct inj_call *call = &process->parasite.control->holder;
 
 	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND | SIGCHLD);
+	call_add(call, SYS_clone, CLONE_VM | CLONE_FILES | CLONE_SIGHAND | SIGCHLD);
 	if (parasite_send(&process->parasite, between, &process->holder_base, call, err) ||
 	    parasite_run_clone(between, call, holder, err))
 		return -1;
@@ -881,8 +912,10 @@ static void reap_left_child(const struct process *process, avc_remote parasite,
  * child; the intermediate task is reaped by its parent, which does so in any case before it
  * returns, whether we are alive or not.  It has no exit signal, so that the app does not notice.
  *
- * This holder also clones the templates.  They get its signal handlers and working directory, which
- * are therefore shared with the app (CLONE_SIGHAND, CLONE_FS). */
+ * This holder also clones the templates.  They get its signal handlers, which are therefore shared
+ * with the app (CLONE_SIGHAND), and its directories and umask.  To share those (CLONE_FS) would take
+ * the privileges from a set-user-ID program that the app executes (fs/exec.c, check_unsafe_exec()).
+ * So there is another holder when the app has changed them (process_has_moved()). */
 int process_hold_stopped(struct process *process, pid_t init, struct avc_error *err)
 {
 	struct inj_call *call = &process->parasite.control->runner;
@@ -896,12 +929,13 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
 			    "its main thread has ended");
 	if (thread->creds.subreaper && check_adoption(process, err))
 		return -1;
+	process->folders = folders_of(process, -1);
 	call_begin(call, INJ_AFTER_HOME);
 	if (thread->creds.subreaper)
 		call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER);
 	for (uint32_t i = 0; i < process->old_parasites && i < INJ_CALLS_MAX / 2; i++)
 		reap_left_child(process, process->old_parasite[i].base, call);
-	call_add(call, SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND);
+	call_add(call, SYS_clone, CLONE_VM | CLONE_FILES | CLONE_SIGHAND);
 	call_add(call, INJ_WAIT);
 	if (thread->creds.subreaper)
 		call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 1);

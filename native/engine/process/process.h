@@ -162,6 +162,9 @@ int process_resume_adoption(struct process *process, struct avc_error *err) warn
 int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 		 struct avc_error *err) warn_unused;
 void process_unhold(struct process *process);
+/* Whether it has other directories, or another umask (-1: to be looked up), than its holder, which
+ * its templates get. */
+bool process_has_moved(const struct process *process, int32_t umask);
 void process_unhold_soon(struct process *process);
 /* From then on the holder belongs to the caller, with its pidfd (-1: there was none). */
 pid_t process_detach_holder(struct process *process, int *pidfd);

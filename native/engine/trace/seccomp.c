@@ -59,8 +59,8 @@ static const struct kind wanted[] = {
 	{ SYS_clone,
 	  CLONE_VM | CLONE_FILES | CLONE_THREAD | CLONE_SIGHAND | CLONE_FS | CLONE_SYSVSEM },
 	{ SYS_clone, CLONE_VM | CLONE_FILES | CLONE_PARENT | SIGCHLD },
-	{ SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND },
-	{ SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND | SIGCHLD },
+	{ SYS_clone, CLONE_VM | CLONE_FILES | CLONE_SIGHAND },
+	{ SYS_clone, CLONE_VM | CLONE_FILES | CLONE_SIGHAND | SIGCHLD },
 	{ SYS_clone, SPAWN_FLAGS },
 	{ SYS_setpgid, ANY },
 	{ SYS_setsid, ANY },
@@ -496,16 +496,18 @@ bool seccomp_is_containers(const struct proc_status *status, uint32_t containers
 
 static bool parse_counts(const char *text, struct proc_status *status)
 {
-	const char *mode = strstr(text, "\nSeccomp:"), *count = strstr(text, "\nSeccomp_filters:");
+	const char *mode = strstr(text, "\nSeccomp:"), *count = strstr(text, "\nSeccomp_filters:"),
+		   *umask = strstr(text, "\nUmask:");
 
-	if (!mode || !count)
+	if (!mode || !count || !umask)
 		return false;
+	status->umask = (uint32_t)strtoul(umask + strlen("\nUmask:"), NULL, 8);
 	status->seccomp = (uint32_t)atoi(mode + strlen("\nSeccomp:"));
 	status->seccomp_filters = (uint32_t)atoi(count + strlen("\nSeccomp_filters:"));
 	return true;
 }
 
-/* Only these two lines, and from an open file where there is one, because all of this is done while
+/* Only these lines, and from an open file where there is one, because all of this is done while
  * the application is stopped. */
 static int read_counts(pid_t tid, int status_fd, struct proc_status *status)
 {
@@ -529,6 +531,7 @@ static int read_confined(const struct process *process, struct thread *thread, i
 	if (read_counts(thread->tid, status_fd, &status))
 		return fail_errno(err, thread->tid, "run injected code", "open(status)",
 				  "it has ended");
+	thread->umask = (int32_t)status.umask;
 	thread->seccomp = process->plain_filters ? SECCOMP_IN_FORCE : SECCOMP_NONE;
 	return seccomp_is_containers(&status, process->plain_filters)
 		       ? 0
@@ -549,6 +552,7 @@ static int read_none(struct thread *thread, int status_fd, struct avc_error *err
 	if (read_counts(thread->tid, status_fd, &status))
 		return fail_errno(err, thread->tid, "run injected code", "open(status)",
 				  "it has ended");
+	thread->umask = (int32_t)status.umask;
 	thread->seccomp = SECCOMP_NONE;
 	return status.seccomp == SECCOMP_MODE_STRICT
 		       ? fail(err, AVC_UNSUPPORTED, 0, thread->tid, "check", "",

@@ -202,6 +202,7 @@ int thread_await(struct process *process, struct thread *thread, struct avc_erro
 	thread->stopped = true;
 	thread->sent_back = false;
 	thread->vetted = false;
+	thread->umask = -1;
 	thread->stop_signal = tracee_group_signal();
 	if (arch_regs_get(thread->tid, &thread->regs)) {
 		thread->stopped = false;

@@ -115,6 +115,7 @@ struct thread {
 	uint32_t filter_count;         /* ... when it was queried (state/filters.c)        */
 	enum seccomp_way seccomp;
 	bool vetted;           /* thread_vet() has checked it at this stop                */
+	int32_t umask;         /* of its process, as read at this stop; -1: it was not        */
 	bool sent_back;        /* into its call, at this stop (ARCH_FORGETS_CALLS)        */
 	struct arch_regs regs; /* as of the stop, EINTR already replaced        */
 	uint64_t sigmask;
@@ -195,6 +196,11 @@ struct process {
 	pid_t holder_inside;
 	int holder_pidfd;
 	struct arch_regs holder_base; /* a user context of it                              */
+	/* When the holder was made, of a process that is not the main one: root and working
+	 * directory, umask. */
+	struct folders {
+		uint64_t device[2], inode[2], mount[2], umask;
+	} folders;
 	struct thread *threads;
 	uint32_t thread_count, thread_room;
 	uint64_t due_ns; /* when the first of its calls has to be ended (waits.c)  */
