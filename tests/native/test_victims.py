@@ -35,11 +35,11 @@ TIMED = [
     *("nanosleep", "clock_nanosleep", "clock_nanosleep_abs", "accept", "recv", "sigtimedwait", "semtimedop"),
     *("io_getevents", "io_pgetevents", "ppoll_const", "select_const", "pselect_const", "accept_old", "connect"),
     *("read_socket", "readv", "preadv2", "recvmsg", "recvmmsg", "send", "write", "writev", "pwritev2", "sendmsg"),
-    *("sendmmsg", "sendfile", "splice"),
+    *("sendmmsg", "sendfile", "splice", "futex_waitv", "clock_nanosleep_tai", "mq_receive", "mq_send", "connect_tcp"),
 ]
 WOKEN = [
-    *(kind for kind in TIMED if "sleep" not in kind and "getevents" not in kind),
-    *("read", "semop", "msgrcv", "flock", "fcntl"),
+    *(kind for kind in TIMED if not re.search("sleep|getevents|tcp", kind)),
+    *("read", "semop", "msgrcv", "flock", "fcntl", "msgsnd", "futex_pi", "open", "eventfd", "inotify", "tee"),
 ]
 
 

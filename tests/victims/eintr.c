@@ -21,25 +21,31 @@
  */
 #include <linux/aio_abi.h>
 #include <linux/futex.h>
+#include <mqueue.h>
+#include <netinet/in.h>
 #include <poll.h>
 #include <pthread.h>
 #include <sched.h>
 #include <signal.h>
 #include <sys/epoll.h>
+#include <sys/eventfd.h>
 #include <sys/file.h>
+#include <sys/inotify.h>
 #include <sys/ipc.h>
 #include <sys/msg.h>
 #include <sys/select.h>
 #include <sys/sem.h>
 #include <sys/sendfile.h>
 #include <sys/socket.h>
+#include <sys/stat.h>
 #include <sys/uio.h>
 #include <sys/un.h>
 #include <ucontext.h>
 
 #include "inlined.h"
 
-#define ERESTARTSYS 512 /* linux/errno.h; never to be seen by a program */
+#define FUTEX_OF_32_BITS 2 /* FUTEX2_SIZE_U32; the headers may be older */
+#define ERESTARTSYS 512    /* linux/errno.h; never to be seen by a program */
 
 enum { CALLS, EINTRS, SHORTEST, LONGEST, TIMEOUTS, WAKES, STARTED, PUNCTUAL, KINDS = 8 };
 
@@ -54,9 +60,12 @@ struct place {
 	const char *name;
 	void *constant; /* the same as `timeout`, in memory that can only be read */
 	pthread_t thread;
-	bool has_thread, call_is_pause;
+	bool has_thread, call_is_pause, locked;
 	volatile unsigned long handled, handled_before;
 	int pipe_fd[2], pair_fd[2], lock_fd[2], listen_fd, epoll_fd, program_fd, sem_id, msg_id;
+	int other_fd[2], count_fd, watch_fd, fifo_fd, tcp_fd;
+	mqd_t queue;
+	struct sockaddr_in tcp_at;
 	struct sockaddr_un listen_at;
 	socklen_t listen_len;
 	uint32_t word;
@@ -446,6 +455,123 @@ static int do_msgrcv(void)
 	return CALL5(SYS_msgrcv, here->msg_id, &message, sizeof(message.text), 0, 0) < 0 ? -1 : 1;
 }
 
+static int do_msgsnd(void)
+{
+	struct message message = { .type = 1 };
+
+	return CALL4(SYS_msgsnd, here->msg_id, &message, sizeof(message.text), 0) < 0 ? -1 : 1;
+}
+
+static int do_futex_waitv(void)
+{
+	const struct {
+		uint64_t value, address;
+		uint32_t flags, reserved;
+	} waiter = { 0, (uintptr_t)&here->word, FUTEX_OF_32_BITS | FUTEX_PRIVATE_FLAG, 0 };
+
+	if (CALL5(SYS_futex_waitv, &waiter, 1, 0, deadline(), CLOCK_MONOTONIC) < 0 &&
+	    errno != EAGAIN)
+		return errno == ETIMEDOUT ? 0 : -1;
+	__atomic_store_n(&here->word, 0, __ATOMIC_SEQ_CST);
+	return 1;
+}
+
+/* Who wakes it locks it again. */
+static int do_futex_pi(void)
+{
+	if (CALL4(SYS_futex, &here->word, FUTEX_LOCK_PI | FUTEX_PRIVATE_FLAG, 0, NULL) < 0)
+		return -1;
+	must(syscall(SYS_futex, &here->word, FUTEX_UNLOCK_PI | FUTEX_PRIVATE_FLAG, 0, NULL) == 0,
+	     "FUTEX_UNLOCK_PI");
+	return 1;
+}
+
+static struct timespec *date(clockid_t clock)
+{
+	struct timespec now;
+
+	clock_gettime(clock, &now);
+	here->timeout = after((double)now.tv_sec + (double)now.tv_nsec / 1e9 +
+			      (here->seconds > 0 ? here->seconds : 1e6));
+	return &here->timeout;
+}
+
+static int do_clock_nanosleep_tai(void)
+{
+	return (int)CALL4(SYS_clock_nanosleep, CLOCK_TAI, TIMER_ABSTIME, date(CLOCK_TAI), NULL);
+}
+
+static int do_mq_receive(void)
+{
+	char text[8];
+
+	if (CALL5(SYS_mq_timedreceive, here->queue, text, sizeof text, NULL,
+		  here->seconds > 0 ? date(CLOCK_REALTIME) : NULL) < 0)
+		return errno == ETIMEDOUT ? 0 : -1;
+	return 1;
+}
+
+static int do_mq_send(void)
+{
+	if (CALL5(SYS_mq_timedsend, here->queue, "", 1, 0,
+		  here->seconds > 0 ? date(CLOCK_REALTIME) : NULL) < 0)
+		return errno == ETIMEDOUT ? 0 : -1;
+	return 1;
+}
+
+static int do_open(void)
+{
+	char path[32];
+	long fd;
+
+	snprintf(path, sizeof(path), "/proc/self/fd/%d", here->fifo_fd);
+	fd = CALL4(SYS_openat, AT_FDCWD, path, O_RDONLY | O_CLOEXEC, 0);
+	if (fd < 0)
+		return -1;
+	close((int)fd);
+	return 1;
+}
+
+static int do_eventfd(void)
+{
+	uint64_t n;
+
+	return CALL3(SYS_read, here->count_fd, &n, sizeof n) < 0 ? -1 : 1;
+}
+
+static int do_inotify(void)
+{
+	char event[512];
+
+	return CALL3(SYS_read, here->watch_fd, event, sizeof event) < 0 ? -1 : 1;
+}
+
+/* To a port whose queue is full: it is accepted with the next of its SYNs, seconds later. */
+static int do_connect_tcp(void)
+{
+	const int fd = socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
+	int result;
+
+	must(fd >= 0, "socket");
+	if (here->seconds > 0)
+		set_timeout(fd, SO_SNDTIMEO);
+	result = CALL3(SYS_connect, fd, &here->tcp_at, sizeof here->tcp_at) >= 0 ? 1
+		 : errno == EINPROGRESS                                          ? 0
+										 : -1;
+	close(fd);
+	return result;
+}
+
+static int do_tee(void)
+{
+	const long n = CALL4(SYS_tee, here->pipe_fd[0], here->other_fd[1], 1, 0);
+	char c;
+
+	if (n == 1)
+		must(read(here->other_fd[0], &c, 1) == 1, "read");
+	return drain(n);
+}
+
 static int do_io_getevents(void)
 {
 	struct io_event event;
@@ -609,6 +735,74 @@ static void wake_msg(void)
 	must(!msgsnd(here->msg_id, &message, sizeof(message.text), 0), "msgsnd");
 }
 
+static void wake_msgsnd(void)
+{
+	struct message message;
+
+	while (msgrcv(here->msg_id, &message, sizeof(message.text), 0, IPC_NOWAIT) >= 0)
+		;
+	must(errno == ENOMSG, "msgrcv");
+}
+
+static void wake_futex_pi(void)
+{
+	if (here->locked)
+		must(syscall(SYS_futex, &here->word, FUTEX_UNLOCK_PI | FUTEX_PRIVATE_FLAG, 0,
+			     NULL) == 0,
+		     "FUTEX_UNLOCK_PI");
+	while (syscall(SYS_futex, &here->word, FUTEX_LOCK_PI | FUTEX_PRIVATE_FLAG, 0, NULL))
+		must(errno == EINTR || errno == EAGAIN, "FUTEX_LOCK_PI");
+	here->locked = true;
+}
+
+static void wake_mq_receive(void)
+{
+	must(!mq_send(here->queue, "", 1, 0) || errno == EAGAIN, "mq_send");
+}
+
+static void wake_mq_send(void)
+{
+	const struct timespec past = { 0 };
+	char text[8];
+
+	while (mq_timedreceive(here->queue, text, sizeof text, NULL, &past) >= 0)
+		;
+	must(errno == ETIMEDOUT, "mq_receive");
+}
+
+static void wake_open(void)
+{
+	char path[32];
+	int fd;
+
+	snprintf(path, sizeof(path), "/proc/self/fd/%d", here->fifo_fd);
+	fd = open(path, O_WRONLY | O_NONBLOCK | O_CLOEXEC);
+	must(fd >= 0 || errno == ENXIO, path);
+	if (fd >= 0)
+		close(fd);
+}
+
+static void wake_eventfd(void)
+{
+	must(!eventfd_write(here->count_fd, 1), "write");
+}
+
+static void wake_inotify(void)
+{
+	char path[32];
+
+	snprintf(path, sizeof(path), "/proc/self/fd/%d", here->fifo_fd);
+	must(!chmod(path, 0600), path);
+}
+
+static void wake_connect_tcp(void)
+{
+	const int fd = accept4(here->tcp_fd, NULL, NULL, SOCK_CLOEXEC | SOCK_NONBLOCK);
+
+	if (fd >= 0)
+		close(fd);
+}
+
 static const struct kind {
 	const char *name;
 	int (*call)(void);
@@ -658,6 +852,17 @@ static const struct kind {
 	{ "fcntl", do_fcntl, wake_fcntl, true },
 	{ "pause", do_pause, wake_thread, true },
 	{ "sigsuspend", do_sigsuspend, wake_thread, true },
+	{ "msgsnd", do_msgsnd, wake_msgsnd, true },
+	{ "futex_waitv", do_futex_waitv, wake_futex, false },
+	{ "futex_pi", do_futex_pi, wake_futex_pi, true },
+	{ "clock_nanosleep_tai", do_clock_nanosleep_tai, NULL, false },
+	{ "mq_receive", do_mq_receive, wake_mq_receive, false },
+	{ "mq_send", do_mq_send, wake_mq_send, false },
+	{ "open", do_open, wake_open, true },
+	{ "eventfd", do_eventfd, wake_eventfd, true },
+	{ "inotify", do_inotify, wake_inotify, true },
+	{ "connect_tcp", do_connect_tcp, wake_connect_tcp, false },
+	{ "tee", do_tee, wake_pipe, true },
 };
 
 static struct place places[sizeof(kinds) / sizeof(kinds[0])];
@@ -705,6 +910,51 @@ static void open_locked(bool whole)
 		lock_range(here->lock_fd[1], F_WRLCK);
 }
 
+static void make_fifo(void)
+{
+	char path[32] = "/tmp/eintr-XXXXXX";
+
+	must(mkdtemp(path) != NULL, path);
+	here->watch_fd = inotify_init1(IN_CLOEXEC);
+	must(!chdir(path) && !mkfifo("fifo", 0600), path);
+	here->fifo_fd = open("fifo", O_PATH | O_CLOEXEC);
+	must(here->fifo_fd >= 0 && inotify_add_watch(here->watch_fd, "fifo", IN_ATTRIB) >= 0, path);
+	must(!unlink("fifo") && !chdir("/") && !rmdir(path), path);
+}
+
+static void open_queue(void)
+{
+	struct mq_attr attr = { .mq_maxmsg = 8, .mq_msgsize = 8 };
+	char name[32];
+
+	snprintf(name, sizeof(name), "/eintr-%d-%d", getpid(), (int)(here - places));
+	here->queue = mq_open(name, O_RDWR | O_CREAT | O_EXCL | O_CLOEXEC, 0600, &attr);
+	if (here->queue < 0)
+		unavailable("mq_open");
+	must(!mq_unlink(name), name);
+}
+
+static void listen_tcp(void)
+{
+	socklen_t bytes = sizeof here->tcp_at;
+
+	here->tcp_at.sin_family = AF_INET;
+	here->tcp_at.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+	here->tcp_fd = socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
+	must(here->tcp_fd >= 0 &&
+		     !bind(here->tcp_fd, (struct sockaddr *)&here->tcp_at, sizeof here->tcp_at) &&
+		     !listen(here->tcp_fd, 0) &&
+		     !getsockname(here->tcp_fd, (struct sockaddr *)&here->tcp_at, &bytes),
+	     "listen");
+	for (int i = 0; i < 2; i++) {
+		const int fd = socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC | SOCK_NONBLOCK, 0);
+
+		must(fd >= 0 && (!connect(fd, (struct sockaddr *)&here->tcp_at, bytes) ||
+				 errno == EINPROGRESS),
+		     "connect");
+	}
+}
+
 static void set_up(const struct kind *kind, double seconds)
 {
 	struct epoll_event event = { .events = EPOLLIN };
@@ -749,6 +999,16 @@ static void set_up(const struct kind *kind, double seconds)
 		must((here->sem_id = semget(IPC_PRIVATE, 1, 0600)) >= 0, "semget");
 	if (kind->call == do_msgrcv)
 		must((here->msg_id = msgget(IPC_PRIVATE, 0600)) >= 0, "msgget");
+	if (kind->call == do_msgsnd)
+		must((here->msg_id = msgget(IPC_PRIVATE, 0600)) >= 0, "msgget");
+	here->count_fd = eventfd(0, EFD_CLOEXEC);
+	must(here->count_fd >= 0 && !pipe2(here->other_fd, O_CLOEXEC), "eventfd");
+	if (kind->call == do_open || kind->call == do_inotify)
+		make_fifo();
+	if (kind->call == do_mq_receive || kind->call == do_mq_send)
+		open_queue();
+	if (kind->call == do_connect_tcp)
+		listen_tcp();
 	if (is_aio(kind) && syscall(SYS_io_setup, 4, &here->aio) < 0)
 		unavailable("io_setup");
 }
