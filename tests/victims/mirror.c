@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
  * mirror: reads all that the kernel tells it of itself, again and again: /proc, prctl(2), limits,
- * timers, masks, handlers, socket options, mincore(2).  Whatever is not as it was before anybody
+ * timers, masks, handlers, socket options, mincore(2), fstat(2).  Whatever is not as it was before anybody
  * protected it is a violation, but for what docs/limits.md names: the parasite, what /proc says for
  * a moment of a thread that has not come home yet, and who shares a page (Rss, Locked).
  * counter[0] is how often it has looked.
@@ -33,12 +33,15 @@
 #define OPTIONS 90
 #define SIGNALS 64
 #define PRCTLS 80
+#define PR_GET_MDWE_ 66 /* the headers may be older */
+#define PR_GET_MEMORY_MERGE_ 68
+#define IOPRIO_WHO_PROCESS 1
 #define WAITERS 6
 #define LOOKS 50
 
 static char first[VIEW_BYTES], view[VIEW_BYTES], file_text[256 * 1024];
 static size_t used;
-static char *region, *mapped;
+static char *region, *mapped, *shared;
 static int sockets[2], datagrams[2], pipes[2];
 static uint32_t never;
 static volatile int waiting;
@@ -109,12 +112,16 @@ static void make_memory(void)
 {
 	const int file = open("/proc/self/exe", O_RDONLY | O_CLOEXEC);
 
+	const int memory = memfd_create("mirror", MFD_CLOEXEC);
+
+	must(memory >= 0 && !ftruncate(memory, REGION_PAGES * 4096), "memfd_create");
+	shared = mmap(NULL, REGION_PAGES * 4096, PROT_READ | PROT_WRITE, MAP_SHARED, memory, 0);
 	region = mmap(NULL, REGION_PAGES * 4096, PROT_READ | PROT_WRITE,
 		      MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
 	mapped = mmap(NULL, 16384, PROT_READ, MAP_SHARED, file, 0);
-	must(region != MAP_FAILED && mapped != MAP_FAILED, "mmap");
+	must(region != MAP_FAILED && mapped != MAP_FAILED && shared != MAP_FAILED, "mmap");
 	for (int i = 0; i < REGION_PAGES; i += 3)
-		region[i * 4096] = 1;
+		region[i * 4096] = shared[i * 4096] = 1;
 	must(!madvise(page(8), 8192, MADV_DONTFORK) && !madvise(page(12), 8192, MADV_WIPEONFORK) &&
 		     !madvise(page(16), 8192, MADV_NOHUGEPAGE) &&
 		     !madvise(page(20), 8192, MADV_DONTDUMP) &&
@@ -313,6 +320,7 @@ static void look_at_thread(const char *name)
 static void look_at_descriptor(const char *name)
 {
 	char path[320], target[256];
+	struct stat st;
 	ssize_t n;
 
 	snprintf(path, sizeof path, "/proc/self/fd/%s", name);
@@ -320,6 +328,10 @@ static void look_at_descriptor(const char *name)
 		return;
 	n = readlink(path, target, sizeof target);
 	say("%s: %.*s\n", path, n > 0 ? (int)n : 0, target);
+	if (!stat(path, &st))
+		say("%s: %#x, %ld bytes in %ld, read %ld.%09ld, written %ld.%09ld\n", path,
+		    st.st_mode, st.st_size, st.st_blocks, st.st_atim.tv_sec, st.st_atim.tv_nsec,
+		    st.st_mtim.tv_sec, st.st_mtim.tv_nsec);
 	snprintf(path, sizeof path, "/proc/self/fdinfo/%s", name);
 	look_at(path, no_time_left);
 }
@@ -344,15 +356,20 @@ static void look_at_calls(void)
 	struct itimerval timer;
 	stack_t stack;
 	sigset_t set;
+	cpu_set_t cpus;
+	size_t robust_bytes = 0;
+	unsigned long robust = 0;
 	int value;
 
-	must(!mincore(region, REGION_PAGES * 4096, pages), "mincore");
-	for (int i = 0; i < REGION_PAGES; i++)
-		say("mincore: page %d is %d\n", i, pages[i] & 1);
+	for (int k = 0; k < 2; k++) {
+		must(!mincore(k ? shared : region, REGION_PAGES * 4096, pages), "mincore");
+		for (int i = 0; i < REGION_PAGES; i++)
+			say("mincore: page %d of %d is %d\n", i, k, pages[i] & 1);
+	}
 	for (int i = 1; i <= SIGNALS; i++)
 		if (!sigaction(i, NULL, &action))
-			say("sigaction: %d is %p, %#x\n", i, (void *)action.sa_handler,
-			    (unsigned int)action.sa_flags);
+			say("sigaction: %d is %p, %#x, %#lx\n", i, (void *)action.sa_handler,
+			    (unsigned int)action.sa_flags, *(uint64_t *)&action.sa_mask);
 	for (int i = 0; i < RLIM_NLIMITS; i++)
 		if (!getrlimit(i, &limit))
 			say("getrlimit: %d is %lu, %lu\n", i, limit.rlim_cur, limit.rlim_max);
@@ -363,7 +380,8 @@ static void look_at_calls(void)
 					     PR_GET_TIMING,      PR_GET_SECUREBITS,
 					     PR_GET_TIMERSLACK,  PR_GET_NO_NEW_PRIVS,
 					     PR_GET_THP_DISABLE, PR_MCE_KILL_GET,
-					     PR_GET_IO_FLUSHER,  PR_GET_SECCOMP };
+					     PR_GET_IO_FLUSHER,  PR_GET_SECCOMP,
+					     PR_GET_MDWE_,       PR_GET_MEMORY_MERGE_ };
 		uint64_t answer = 0;
 
 		for (size_t k = 0; k < sizeof asking / sizeof *asking; k++)
@@ -394,6 +412,11 @@ static void look_at_calls(void)
 	say("getitimer: %d\n", timer.it_value.tv_sec > 1000);
 	say("waitpid: %d\n", waitpid(-1, NULL, WNOHANG | __WALL));
 	say("getpriority: %d, scheduler %d\n", getpriority(PRIO_PROCESS, 0), sched_getscheduler(0));
+	must(!sched_getaffinity(0, sizeof cpus, &cpus) &&
+		     !syscall(SYS_get_robust_list, 0, &robust, &robust_bytes),
+	     "get_robust_list");
+	say("CPUs: %d, I/O priority %ld, robust list %#lx, %zu\n", CPU_COUNT(&cpus),
+	    syscall(SYS_ioprio_get, IOPRIO_WHO_PROCESS, 0), robust, robust_bytes);
 	value = (int)umask(027);
 	say("umask: %o, pid %d, parent %d, group %d, session %d\n", (unsigned int)value, getpid(),
 	    getppid(), getpgrp(), getsid(0));
@@ -405,7 +428,8 @@ static void look(void)
 		"maps",          "limits",   "cgroup",    "oom_score_adj",   "environ",
 		"cmdline",       "auxv",     "comm",      "coredump_filter", "personality",
 		"timerslack_ns", "loginuid", "sessionid", "uid_map",         "gid_map",
-		"setgroups",     "cpuset",   "autogroup", "timers",
+		"setgroups",     "cpuset",   "autogroup", "timers",          "timens_offsets",
+		"attr/current",
 	};
 	char path[64];
 
