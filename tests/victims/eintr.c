@@ -550,14 +550,14 @@ static int do_inotify(void)
 static int do_connect_tcp(void)
 {
 	const int fd = socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
-	int result;
+	int result = 1;
 
 	must(fd >= 0, "socket");
 	if (here->seconds > 0)
 		set_timeout(fd, SO_SNDTIMEO);
-	result = CALL3(SYS_connect, fd, &here->tcp_at, sizeof here->tcp_at) >= 0 ? 1
-		 : errno == EINPROGRESS                                          ? 0
-										 : -1;
+	/* EALREADY: made again by a restored process, for which nobody ends it in time. */
+	if (CALL3(SYS_connect, fd, &here->tcp_at, sizeof here->tcp_at) < 0)
+		result = errno == EINPROGRESS || errno == EALREADY ? 0 : -1;
 	close(fd);
 	return result;
 }
