@@ -426,6 +426,13 @@ def test_descriptors_on_their_way_are_told(tmp_path: Path) -> None:
         assert "descriptors in flight" in guard.wait("restored")["error"]["detail"]
 
 
+def test_what_is_put_back_is_not_sent_by_root(tmp_path: Path) -> None:
+    with Victim(f"sockets senders {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        checkpoint(guard)
+        disturb(victim)
+        assert "senders of its contents are not known" in restored(victim, guard)["error"]["detail"]
+
+
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("scenario", ["unix", "datagrams", "rebound", "early", "options", "dropped", "family"])
 def test_sockets_made_again(scenario: str, where: str, tmp_path: Path) -> None:

@@ -445,6 +445,49 @@ static void user_verify(void)
 	      (int)st.st_uid);
 }
 
+/* ---- who sent what is in them ------------------------------------------------------- */
+
+static uid_t sender_of_order(void)
+{
+	union {
+		char bytes[CMSG_SPACE(sizeof(struct ucred))];
+		struct cmsghdr head;
+	} control;
+	struct iovec io = { scratch, 100 };
+	struct msghdr head = { .msg_iov = &io,
+			       .msg_iovlen = 1,
+			       .msg_control = &control,
+			       .msg_controllen = sizeof control };
+	struct ucred ucred;
+
+	must(recvmsg(fd[1], &head, MSG_DONTWAIT) == 5 && head.msg_controllen, "recvmsg");
+	memcpy(&ucred, CMSG_DATA(&control.head), sizeof ucred);
+	return ucred.uid;
+}
+
+static void senders_setup(void)
+{
+	const int yes = 1;
+
+	must(!setgroups(0, NULL) && !setresgid(NOBODY, NOBODY, NOBODY) &&
+		     !setresuid(NOBODY, NOBODY, NOBODY),
+	     "setresuid");
+	must(socketpair(AF_UNIX, SOCK_SEQPACKET, 0, fd) == 0 &&
+		     setsockopt(fd[1], SOL_SOCKET, SO_PASSCRED, &yes, sizeof yes) == 0,
+	     "socketpair");
+	say(fd[0], "order");
+}
+
+static void senders_disturb(void)
+{
+	must(sender_of_order() == NOBODY, "sender");
+}
+
+static void senders_verify(void)
+{
+	CHECK(sender_of_order() == NOBODY, "an order has become one of root");
+}
+
 static const struct scenario scenarios[] = {
 	{ "messages", messages_setup, messages_disturb, messages_verify },
 	{ "child", child_setup, child_disturb, child_verify },
@@ -454,6 +497,7 @@ static const struct scenario scenarios[] = {
 	{ "flight", flight_setup, nothing, flight_verify },
 	{ "shut", shut_setup, shut_disturb, shut_verify },
 	{ "user", user_setup, user_disturb, user_verify },
+	{ "senders", senders_setup, senders_disturb, senders_verify },
 };
 
 int main(int argc, char **argv)

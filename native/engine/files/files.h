@@ -469,6 +469,9 @@ const char *file_put_state(int fd, const struct file *want, const struct file *n
 /* Reads what is in it; a pipe has to be O_NONBLOCK.  False if it does not become empty: a process outside
  * of the application keeps writing. */
 bool file_drain(int fd, bool pipe);
+/* As send(2).  The kernel tells readers who has sent it (SO_PASSCRED, unix(7)): that is not known any
+ * more, but it was not us. */
+ssize_t file_send_as_nobody(int fd, const void *data, size_t bytes);
 const char *file_put_content(int fd, int other_fd, const struct file *want);
 bool file_tcp_moved(const struct file *want, const struct file *now);
 const char *file_reset_tcp(int fd);

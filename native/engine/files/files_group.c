@@ -527,8 +527,8 @@ static enum mend_state mend(struct group_end *end, const struct avc_end *other,
 			acknowledge(end->fd);
 	}
 	if (end->sent < bytes) {
-		n = send(end->fd, board->content + other->at + end->sent, bytes - end->sent,
-			 MSG_DONTWAIT | MSG_NOSIGNAL);
+		n = file_send_as_nobody(end->fd, board->content + other->at + end->sent,
+					bytes - end->sent);
 		if (n > 0)
 			end->sent += (uint32_t)n;
 		else if (!is_stream(end->file))

@@ -32,6 +32,7 @@
 
 #include "files.h"
 
+#define OVERFLOW_ID 65534 /* a user that has no number (kernel.overflowuid) */
 #define DRAIN_READS 16384 /* more than the small messages that a socket has room for */
 #define TCP_TRIES 8
 #define SET_TICKS _IOW('T', 0, uint64_t) /* linux/timerfd.h, which does not go with the libc's */
@@ -452,6 +453,25 @@ bool file_drain(int fd, bool pipe)
 	return n <= 0;
 }
 
+ssize_t file_send_as_nobody(int fd, const void *data, size_t bytes)
+{
+	union {
+		char bytes[CMSG_SPACE(sizeof(struct ucred))];
+		struct cmsghdr head;
+	} control = { .head = { .cmsg_len = CMSG_LEN(sizeof(struct ucred)),
+				.cmsg_level = SOL_SOCKET,
+				.cmsg_type = SCM_CREDENTIALS } };
+	const struct ucred nobody = { getpid(), OVERFLOW_ID, OVERFLOW_ID };
+	struct iovec io = { (void *)data, bytes };
+	const struct msghdr head = { .msg_iov = &io,
+				     .msg_iovlen = 1,
+				     .msg_control = &control,
+				     .msg_controllen = sizeof control };
+
+	memcpy(CMSG_DATA(&control.head), &nobody, sizeof nobody);
+	return sendmsg(fd, &head, MSG_DONTWAIT | MSG_NOSIGNAL);
+}
+
 const char *file_put_content(int fd, int other_fd, const struct file *want)
 {
 	const bool pipe = want->kind == FILE_PIPE,
@@ -478,8 +498,7 @@ const char *file_put_content(int fd, int other_fd, const struct file *want)
 				from += sizeof bytes;
 				put += sizeof bytes;
 			}
-			n = pipe ? write(out, from, bytes)
-				 : send(out, from, bytes, MSG_DONTWAIT | MSG_NOSIGNAL);
+			n = pipe ? write(out, from, bytes) : file_send_as_nobody(out, from, bytes);
 
 			if (n <= 0)
 				break;
