@@ -9,8 +9,6 @@ import signal
 import socket
 import subprocess
 import tempfile
-import subprocess
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
