@@ -447,7 +447,7 @@ static void user_verify(void)
 
 /* ---- who sent what is in them ------------------------------------------------------- */
 
-static uid_t sender_of_order(void)
+static uid_t sender_of_order(int from)
 {
 	union {
 		char bytes[CMSG_SPACE(sizeof(struct ucred))];
@@ -460,7 +460,7 @@ static uid_t sender_of_order(void)
 			       .msg_controllen = sizeof control };
 	struct ucred ucred;
 
-	must(recvmsg(fd[1], &head, MSG_DONTWAIT) == 5 && head.msg_controllen, "recvmsg");
+	must(recvmsg(from, &head, MSG_DONTWAIT) == 5 && head.msg_controllen, "recvmsg");
 	memcpy(&ucred, CMSG_DATA(&control.head), sizeof ucred);
 	return ucred.uid;
 }
@@ -475,17 +475,25 @@ static void senders_setup(void)
 	must(socketpair(AF_UNIX, SOCK_SEQPACKET, 0, fd) == 0 &&
 		     setsockopt(fd[1], SOL_SOCKET, SO_PASSCRED, &yes, sizeof yes) == 0,
 	     "socketpair");
+	/* This has the kernel name the one that sends. */
+	must(socketpair(AF_UNIX, SOCK_DGRAM, 0, fd + 2) == 0 &&
+		     setsockopt(fd[2], SOL_SOCKET, SO_PASSCRED, &yes, sizeof yes) == 0 &&
+		     setsockopt(fd[3], SOL_SOCKET, SO_PASSCRED, &yes, sizeof yes) == 0,
+	     "socketpair");
 	say(fd[0], "order");
+	say(fd[2], "order");
 }
 
 static void senders_disturb(void)
 {
-	must(sender_of_order() == NOBODY, "sender");
+	must(sender_of_order(fd[1]) == NOBODY && sender_of_order(fd[3]) == NOBODY, "sender");
 }
 
 static void senders_verify(void)
 {
-	CHECK(sender_of_order() == NOBODY, "an order has become one of root");
+	CHECK(sender_of_order(fd[1]) == NOBODY, "an order has become one of root");
+	CHECK(sender_of_order(fd[3]) == NOBODY,
+	      "an order between named ones has become one of root");
 }
 
 static const struct scenario scenarios[] = {

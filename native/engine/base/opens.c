@@ -62,7 +62,9 @@ uint64_t mount_of(int fd)
 
 bool mount_is_served(const char *type)
 {
-	static const char *const served[] = { "fuse", "nfs", "cifs", "smb", "9p", "ceph", "afs" };
+	static const char *const served[] = { "fuse", "nfs",      "cifs",     "smb",    "9p",
+					      "ceph", "afs",      "virtiofs", "vboxsf", "lustre",
+					      "gpfs", "orangefs", "coda",     "autofs" };
 
 	for (size_t i = 0; i < sizeof served / sizeof *served; i++)
 		if (!strncmp(type, served[i], strlen(served[i])))

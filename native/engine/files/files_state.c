@@ -32,6 +32,7 @@
 
 #include "files.h"
 
+#define AUTOBOUND 5       /* hexadecimal digits */
 #define OVERFLOW_ID 65534 /* a user that has no number (kernel.overflowuid) */
 #define DRAIN_READS 16384 /* more than the small messages that a socket has room for */
 #define TCP_TRIES 8
@@ -72,6 +73,29 @@ static int can_protocol(int fd, int type)
 	return getsockopt(fd, SOL_CAN_ISOTP, CAN_ISOTP_OPTS, &options, &bytes) ? 0 : CAN_ISOTP;
 }
 
+/* What the kernel calls a datagram socket that sends with SO_PASSCRED and has no name yet
+ * (unix_autobind()), one of a pair, too. */
+static bool is_autobound(const struct sockaddr_storage *address, socklen_t bytes)
+{
+	const char *name = ((const struct sockaddr_un *)address)->sun_path;
+
+	return bytes == sizeof(sa_family_t) + 1 + AUTOBOUND && !name[0] &&
+	       strspn(name + 1, "0123456789abcdef") >= AUTOBOUND;
+}
+
+/* It gets another one when it sends. */
+static void forget_autobound(struct file_socket *s)
+{
+	const bool local = is_autobound(&s->local, s->local_bytes),
+		   remote = is_autobound(&s->remote, s->remote_bytes);
+
+	if (s->domain != AF_UNIX || s->type != SOCK_DGRAM || !s->connected ||
+	    !(local || s->local_bytes == sizeof(sa_family_t)) ||
+	    !(remote || s->remote_bytes == sizeof(sa_family_t)))
+		return;
+	s->local_bytes = s->remote_bytes = sizeof(sa_family_t);
+}
+
 void file_look_at_socket(int fd, struct file *file)
 {
 	struct file_socket *s = calloc(1, sizeof *s);
@@ -88,6 +112,7 @@ void file_look_at_socket(int fd, struct file *file)
 		s->local_bytes = 0;
 	s->remote_bytes = sizeof s->remote;
 	s->connected = getpeername(fd, (struct sockaddr *)&s->remote, &s->remote_bytes) == 0;
+	forget_autobound(s);
 	if (s->listening && s->protocol == IPPROTO_TCP) {
 		struct tcp_info info = { 0 };
 		socklen_t bytes = sizeof info;
