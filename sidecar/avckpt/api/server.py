@@ -178,18 +178,23 @@ class ApiServer:
                 headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
             )
             await response.prepare(request)
+            clock = asyncio.get_running_loop().time
             try:
                 await response.write(b"retry: 1000\n\n" + b"".join(map(_sse, kept)))
+                said_at = clock()
                 while True:
                     try:
-                        record = await asyncio.wait_for(queue.get(), KEEP_ALIVE_S)
+                        # What is not passed on says nothing to the other side, however often it comes.
+                        record = await asyncio.wait_for(queue.get(), said_at + KEEP_ALIVE_S - clock())
                     except asyncio.TimeoutError:
                         await response.write(b": nothing new\n\n")
+                        said_at = clock()
                         continue
                     if record is None:
                         break
                     if record.seq or wants_all:
                         await response.write(_sse(record))
+                        said_at = clock()
             except ConnectionError:
                 pass  # it has gone
         return response
