@@ -54,6 +54,8 @@ class AvckptError(Exception):
     kind: ClassVar[str] = "failed"
     code: ClassVar[Code | None] = None
     exit_code: ClassVar[ExitCode] = ExitCode.FAILED
+    explained: ClassVar[bool] = False
+    """`detail` says all that a user can use: the line leaves out operation, call and process."""
 
     def __init__(
         self,
@@ -77,16 +79,18 @@ class AvckptError(Exception):
 
     def __str__(self) -> str:
         text = self.detail or "no detail given"
-        if self.operation:
+        if self.operation and not self.explained:
             text = f"{self.operation}: {text}"
         if self.container:
             text = f"{self.container}: {text}"
         facts = []
-        if self.syscall and self.errno:
+        if self.explained:
+            pass
+        elif self.syscall and self.errno:
             facts.append(f"{self.syscall}: {os.strerror(self.errno)}")
         elif self.syscall or self.errno:
             facts.append(self.syscall or os.strerror(self.errno))
-        if self.pid:
+        if self.pid and not self.explained:
             facts.append(f"pid {self.pid}")
         if self.undo_failures:
             facts.append(f"{self.undo_failures} step(s) could not be undone")
@@ -112,6 +116,7 @@ class TargetGone(AvckptError):
 
     kind = "gone"
     code = Code.GONE
+    explained = True
 
 
 class Denied(AvckptError):
@@ -134,6 +139,7 @@ class Busy(AvckptError):
 
     kind = "busy"
     code = Code.BUSY
+    explained = True
     exit_code = ExitCode.UNPROTECTED
 
 
@@ -142,6 +148,7 @@ class DeadlineMissed(AvckptError):
 
     kind = "deadline"
     code = Code.DEADLINE
+    explained = True
 
 
 class Paused(AvckptError):
@@ -190,6 +197,7 @@ class NothingToRestore(AvckptError):
 
     kind = "empty"
     code = Code.EMPTY
+    explained = True
     exit_code = ExitCode.UNPROTECTED
 
 

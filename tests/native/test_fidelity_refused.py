@@ -287,7 +287,7 @@ def test_a_tracer_from_outside(tmp_path: Path) -> None:
         since = guard.mark()
         for _ in range(5):
             missed = guard.wait("missed", since=since)
-            assert f"traced by process {strace.process.pid}" in missed["error"]["message"]
+            assert missed["error"]["message"] == f"it is being traced by process {strace.process.pid} (strace)"
             assert missed["generations"] == 2
             since = guard.mark()
         strace.leave()

@@ -10,11 +10,13 @@ from avckpt import errors
 from avckpt._native import ffi
 from avckpt.errors import (
     AvckptError,
+    Busy,
     Code,
     Denied,
     ExitCode,
     KernelError,
     NoSuchContainer,
+    NothingToRestore,
     SidecarUnreachable,
     class_of_code,
     from_json,
@@ -39,6 +41,11 @@ def test_the_line_a_person_sees() -> None:
         "(ptrace(PTRACE_SEIZE): Operation not permitted, pid 42, 1 step(s) could not be undone)"
     )
     assert str(NoSuchContainer("nobody")) == "nobody"
+    assert str(NothingToRestore("that generation is not held", operation="command", pid=42, container="web")) == (
+        "web: that generation is not held"
+    )
+    traced = Busy("it is traced by strace", operation="stop", syscall="ptrace(SEIZE)", errno=errno.EPERM, pid=42)
+    assert str(traced) == "it is traced by strace"
     assert str(Denied("not allowed", operation="freeze", container="web")) == "web: freeze: not allowed"
 
 

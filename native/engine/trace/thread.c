@@ -4,6 +4,7 @@
  */
 #include <errno.h>
 #include <sched.h>
+#include <string.h>
 #include <sys/mman.h>
 #include <sys/ptrace.h>
 #include <sys/syscall.h>
@@ -82,14 +83,19 @@ static int seize_failed(pid_t pid, pid_t tid, struct avc_error *err)
 {
 	const int errnum = errno;
 	struct proc_status status;
+	char name[16 + 1] = "?"; /* TASK_COMM_LEN, with a line feed at its end */
 
 	if (errnum == EPERM) {
 		if (proc_status(tid, &status) || status.locked_kb < 0)
 			return fail(err, AVC_GONE, errnum, tid, "stop", "ptrace(SEIZE)",
 				    "it has ended");
-		if (status.tracer)
+		if (status.tracer) {
+			/* It may have gone just now. */
+			proc_read(status.tracer, "comm", name, sizeof name);
 			return fail(err, AVC_BUSY, errnum, pid, "stop", "ptrace(SEIZE)",
-				    "it is being traced by process %d", status.tracer);
+				    "it is being traced by process %d (%.*s)", status.tracer,
+				    (int)strcspn(name, "\n"), name);
+		}
 	}
 	/* Its tracer may have just exited. */
 	if (errnum == EPERM && tracee_seize(tid, (long)TRACE_OPTIONS_APP) == 0)
