@@ -10,7 +10,7 @@ from pathlib import Path
 
 import avckpt
 import pytest
-from avckpt.cli import doctor
+from avckpt.cli import doctor, install
 from avckpt.cli.doctor import ConfigFacts, Facts, PodmanFacts, Status
 
 GOOD = Facts(
@@ -115,6 +115,29 @@ def test_what_is_wrong_is_said_with_a_remedy(
     assert detail in check.detail
     assert remedy in check.remedy
     assert all(check.remedy for check in found if check.status is not Status.OK)
+
+
+@pytest.mark.parametrize("gone", [str(install.DROP_IN), str(install.INIT_PROGRAM)])
+def test_an_installed_file_that_is_gone_has_one_remedy(gone: str) -> None:
+    change = {
+        "missing_files": (gone,),
+        "hooks_dir_problems": ("Podman does not look there: write x",),
+        "init_problem": f"{gone}: No such file or directory",
+    }
+    if gone == str(install.INIT_PROGRAM):
+        del change["hooks_dir_problems"]
+    else:
+        del change["init_problem"]
+    found = doctor.judge(dataclasses.replace(GOOD, **change))  # type: ignore[arg-type]
+    assert [(each.name, each.remedy) for each in found if each.status is not Status.OK] == [
+        ("hooks", "run: sudo avckpt install")
+    ]
+
+
+def test_what_uninstall_has_left_for_running_containers_is_no_installation(monkeypatch: pytest.MonkeyPatch) -> None:
+    left = install.Manifest(avckpt.__version__, (install.HOOK_PROGRAM,))
+    monkeypatch.setattr(install.Manifest, "read", lambda: left)
+    assert doctor._installation() == (None, (), (), "")
 
 
 def test_looking_at_this_machine_ends_in_verdicts() -> None:

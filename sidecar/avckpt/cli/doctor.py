@@ -23,7 +23,7 @@ from typing import Any
 import avckpt
 from avckpt.cli import containers_conf, install, sidecar_container
 from avckpt.cli.client import run_it
-from avckpt.cli.install import HOOK_PROGRAM, HOOKS_DIR, INIT_PROGRAM, Manifest
+from avckpt.cli.install import DROP_IN, HOOK_PROGRAM, HOOKS_DIR, INIT_PROGRAM, Manifest
 from avckpt.errors import AvckptError
 
 
@@ -253,11 +253,15 @@ def _judge_installation(facts: Facts) -> Iterator[Check]:
         yield Check("hooks", Status.WARN, f"of another build than this avckpt: {_few(facts.outdated_files)}", again)
     else:
         yield Check("hooks", Status.OK, f"version {facts.installed_version}, {HOOK_PROGRAM}")
-    if facts.init_problem:
+    if str(INIT_PROGRAM) in facts.missing_files:
+        pass  # said above
+    elif facts.init_problem:
         yield Check("init", Status.FAIL, facts.init_problem, again)
     else:
         yield Check("init", Status.OK, str(INIT_PROGRAM))
-    if facts.hooks_dir_problems:
+    if str(DROP_IN) in facts.missing_files:
+        pass  # it is what tells Podman
+    elif facts.hooks_dir_problems:
         for problem in facts.hooks_dir_problems:
             what, _, remedy = problem.rpartition(": ")
             yield Check("hooks_dir", Status.FAIL, what, remedy)
@@ -371,7 +375,7 @@ def _installation() -> tuple[str | None, tuple[str, ...], tuple[str, ...], str]:
         manifest = Manifest.read()
     except AvckptError as error:
         return UNKNOWN, (), (), str(error)
-    if manifest is None:
+    if manifest is None or DROP_IN not in manifest.files:  # or only what running containers will call
         return None, (), (), ""
     outdated: tuple[str, ...] = ()
     with contextlib.suppress(AvckptError):  # nothing of our own to compare them with
