@@ -366,6 +366,8 @@ def test_uninstall_leaves_nothing_of_hooks_and_sidecar(root: Path) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX)
         install.uninstall(root)
         assert (folder / "history.jsonl").exists()
+    assert install.uninstall(root)[:2] == ["nothing is installed", "removed /run/avckpt/history.jsonl"]
+    assert install.uninstall(root) == ["nothing is installed"]
     install.install(root)
     install.uninstall(root)
     assert tree(root) == before

@@ -268,9 +268,10 @@ def uninstall(root: Path = _HOST) -> list[str]:
     if os.geteuid() != 0:
         raise Denied("this needs root (sudo avckpt uninstall)")
     manifest = Manifest.read(root)
-    if manifest is None:
-        return ["nothing is installed"]
     callers = _callers(root)
+    if manifest is None:
+        left = [] if callers else leftovers.remove(root, _run_dir())
+        return ["nothing is installed", *(f"removed {path}" for path in left)]
     naming = _naming_the_runtime(root)
     programs = (HOOK_PROGRAM, RUNTIME_PROGRAM)
     kept = [path for path in manifest.files if (callers or naming) and (path in programs or _PACKAGE in path.parents)]
