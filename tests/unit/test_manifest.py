@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from pathlib import Path
 
 import pytest
+from avckpt import yamlfile
 from avckpt.cli import commands
 from avckpt.cli.compose import podman_compose
 from avckpt.cli.compose.manifest import Kind, Manifest, Severity, check, files_meant
@@ -211,6 +214,21 @@ def test_files_that_are_something_else(path: Path, text: str, problem: str) -> N
 def avckpt(*args: object) -> tuple[int, str]:
     result = CliRunner().invoke(commands.main, [str(arg) for arg in args])
     return result.exit_code, result.output
+
+
+def test_a_file_that_may_not_be_read_is_a_wrong_file(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not wrong usage: whoever reads it says why."""
+    path.write_text(SHARED)
+
+    def refuse(name: str, bound: int) -> bytes:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), name)
+
+    monkeypatch.setattr(os, "access", lambda *args, **more: False)
+    monkeypatch.setattr(yamlfile, "read_bounded", refuse)
+    assert avckpt("check", path) == (
+        1,
+        f"{path}:1: Permission denied\n0 services, to be protected: none; 1 problem\n",
+    )
 
 
 def test_the_command(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

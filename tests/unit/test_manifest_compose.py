@@ -82,6 +82,30 @@ def test_what_it_says_is_passed_on_but_for_ids() -> None:
         Fake("echo and more; echo project_service_1; exit 1").up([], said.append)
 
 
+def test_a_warning_that_podman_repeats_is_said_once() -> None:
+    said: list[str] = []
+    lines = [f'time="2026-11-29T01:11:0{i}Z" level=warning msg="{what}"' for i, what in enumerate("aba")]
+    Fake("; ".join(f"echo '{line}'" for line in lines)).up([], said.append)
+    assert said == lines[:2]
+
+
+def test_a_question_that_fails_is_told_as_podman_composes() -> None:
+    compose = podman_compose.Compose([Path("compose.yaml")])
+    compose._command = [sys.executable, "-c", "raise SystemExit('ValueError: bad mount')", "podman_compose"]
+    with pytest.raises(AvckptError, match="^podman-compose ps failed: ValueError: bad mount$"):
+        compose.containers()
+
+
+def test_a_job_that_is_done_is_no_reason_for_a_failure(tmp_path: Path) -> None:
+    class Two(Fake):
+        def containers(self) -> list[Started]:
+            return [container(name="job", status="exited"), container(name="bad", status="exited", exit_code=3)]
+
+    with pytest.raises(AvckptError) as failure:
+        up(Two("echo bad port; exit 1"), [], tmp_path, 0, lambda line: None)
+    assert str(failure.value) == ("podman-compose up failed: bad port; bad has exited with status 3 (podman logs bad)")
+
+
 def test_a_traceback_is_its_last_line() -> None:
     said: list[str] = []
     program = "def f(): {}['a']\ntry:\n  f()\nexcept KeyError:\n  raise ValueError('no such thing')"

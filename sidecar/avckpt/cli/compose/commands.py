@@ -19,10 +19,13 @@ if TYPE_CHECKING:
     from avckpt.cli.compose.podman_compose import Compose
     from avckpt.cli.compose.vehicle import Protection
 
+FILE = click.Path(readable=False, path_type=Path)
+"""Whoever reads it says why that cannot be done: no wrong usage, but a wrong file."""
+
 files_option = click.option(
     *("-f", "--file", "files"),
     multiple=True,
-    type=click.Path(path_type=Path),
+    type=FILE,
     help="Compose file; default vehicle.yaml, or those that podman-compose reads.",
 )
 project_option = click.option("-p", "--project-name", "project", default="", help="As for podman-compose.")
@@ -35,8 +38,8 @@ env_file_option = click.option(
 
 
 @click.command()
-@click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[FILE...]")
-@click.option("-f", "--file", "more", multiple=True, type=click.Path(path_type=Path), help="As for avckpt up.")
+@click.argument("files", nargs=-1, type=FILE, metavar="[FILE...]")
+@click.option("-f", "--file", "more", multiple=True, type=FILE, help="As for avckpt up.")
 @click.option("--config", "is_config", is_flag=True, help="The sidecar's; default /etc/avckpt/config.yaml.")
 @click.option("--json", "as_json", is_flag=True, help="A JSON object instead of text.")
 def check(files: tuple[Path, ...], more: tuple[Path, ...], is_config: bool, as_json: bool) -> None:

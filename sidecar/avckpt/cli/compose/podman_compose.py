@@ -40,6 +40,7 @@ _HEALTHY = "--condition=healthy"
 _WAITS = {"--condition=running": "running", _HEALTHY: "healthy"}
 _ONE_WORD = re.compile(r"[\w.-]+")
 _NOT_THERE = ("Error: no container with name or ID", "Error: no pod with name or ID")
+_WARNING = re.compile(r'(?:time="[^"]*" )?(level=warning .*)')
 _TRACEBACKS = ("Traceback (most recent call last):", "During handling of the above", "The above exception was")
 
 
@@ -129,11 +130,16 @@ class Compose:
         try:
             done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=QUERY_TIMEOUT_S)
         except (OSError, subprocess.TimeoutExpired) as error:
-            raise AvckptError(f"{command[0]}: {error}") from error
+            raise AvckptError(f"{_called(command)}: {error}") from error
         if done.returncode != 0 and not lenient:
             lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
-            raise AvckptError(f"{' '.join(command[-2:])}: {lines[-1]}")
+            raise AvckptError(f"{_called(command)} failed: {lines[-1]}")
         return done.stdout
+
+
+def _called(command: Sequence[str]) -> str:
+    """What a user would call it."""
+    return f"podman-compose {command[-2]}" if "podman_compose" in command else " ".join(command[:2])
 
 
 def _watch(process: subprocess.Popen[bytes], look: Callable[[], None]) -> list[str]:
@@ -198,13 +204,14 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 class _Words:
     """The relevant output of podman-compose.
 
-    That is names and ids of what was made or removed, that something was not there to be removed, and of a
-    traceback all but its last line.
+    Left out are names and ids of what was made or removed, that something was not there to be removed, a warning
+    that Podman repeats for each container, and of a traceback all but its last line.
     """
 
     def __init__(self, say: Say) -> None:
         self._say = say
         self._in_traceback = False
+        self._warnings: set[str] = set()
         self.last = ""
         self.error = ""
         """The last line that is an error of Podman's."""
@@ -229,6 +236,11 @@ class _Words:
         elif self._in_traceback:
             self._in_traceback = text[0].isspace()
             return self._in_traceback
+        warning = _WARNING.match(text)
+        if warning:
+            repeated = warning.group(1) in self._warnings
+            self._warnings.add(warning.group(1))
+            return repeated
         return self._in_traceback or _ONE_WORD.fullmatch(text) is not None or text.startswith(_NOT_THERE)
 
 

@@ -108,7 +108,7 @@ def up(compose: Compose, services: Sequence[str], run_dir: Path, wait_s: float, 
         if lacking:
             failure = AvckptError(f"{', '.join(lacking)} has no container: {complaint.removeprefix('Error: ')}")
     if failure is not None:
-        reasons = [f"{one.name} {_why_not_running(one)}" for one in started if not _runs(one)]
+        reasons = [f"{one.name} {_why_not_running(one)}" for one in started if _may_be_why(one, str(failure))]
         raise AvckptError("; ".join([str(failure), *reasons]))
     return wait_protected(compose, Client(run_dir), started, wait_s)
 
@@ -177,6 +177,13 @@ def _missing() -> list[Check]:
 
 def _runs(container: Started) -> bool:
     return container.status in ("running", "paused")
+
+
+def _may_be_why(container: Started, failure: str) -> bool:
+    """A job that is done is no reason, unless it is what was waited for."""
+    if container.status in GONE and container.exit_code == 0:
+        return container.name in failure
+    return not _runs(container)
 
 
 def _why_not_running(container: Started) -> str:
