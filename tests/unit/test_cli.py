@@ -14,8 +14,9 @@ from typing import Any
 
 import pytest
 from avckpt.cli import client, commands
+from avckpt.cli.bundle import find
 from avckpt.cli.client import Client
-from avckpt.errors import NothingToRestore
+from avckpt.errors import NoSuchContainer, NothingToRestore
 from avckpt.guard import Command
 from click.testing import CliRunner, Result
 
@@ -26,6 +27,7 @@ from testkit.harness import ROOT
 @pytest.fixture(autouse=True)
 def run_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("AVCKPT_RUN_DIR", str(tmp_path))
+    monkeypatch.setattr(client, "CONFIG_DIR", tmp_path)
     return tmp_path
 
 
@@ -75,6 +77,76 @@ def test_without_a_sidecar_one_line_says_how_to_start_it(args: list[str], run_di
         f"avckpt: the sidecar is not running (no {run_dir}/api.sock): start it with: podman run"
     )
     assert result.stderr.count("\n") == 1
+
+
+def test_where_nothing_is_installed_the_command_installs_it_first(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(client, "UNITS", ())
+    monkeypatch.setattr(client, "CONFIG_DIR", tmp_path / "nothing")
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    assert "install and start it with: sudo avckpt install && sudo podman run -d" in avckpt("ps").stderr
+
+
+@pytest.mark.parametrize("command", ["checkpoint", "restore", "inspect"])
+@pytest.mark.parametrize("name", ["", "x" * 9000])
+def test_what_can_be_no_name(command: str, name: str) -> None:
+    result = avckpt(command, name)
+    assert result.exit_code == 4
+    assert result.stderr.startswith("avckpt: no container")
+    assert len(result.stderr) < 120
+
+
+def test_no_name_is_no_beginning_of_an_id() -> None:
+    with pytest.raises(NoSuchContainer, match="nothing is known of a container or an event ''"):
+        find([row()], [], "")
+
+
+def test_a_name_that_is_no_text(run_dir: Path) -> None:
+    program = (
+        "import socket,sys; s=socket.socket(socket.AF_UNIX); s.bind(sys.argv[1]); s.listen(); print(flush=True);"
+        "c,_=s.accept(); print(c.recv(9999).split()[1].decode(), flush=True); c.close()"
+    )
+    path = str(run_dir / "api.sock")
+    with subprocess.Popen([sys.executable, "-c", program, path], stdout=subprocess.PIPE) as server:
+        assert server.stdout is not None
+        server.stdout.readline()
+        result = avckpt("inspect", os.fsdecode(b"\xff/"))
+        assert server.stdout.readline() == b"/v1/containers/%FF%2F\n"
+    assert result.exit_code == 3
+    assert "the sidecar went away (" in result.stderr
+
+
+def test_a_sidecar_that_dies_meanwhile_is_told_in_words(run_dir: Path) -> None:
+    program = (
+        "import socket,sys; s=socket.socket(socket.AF_UNIX); s.bind(sys.argv[1]); s.listen(); print(flush=True);"
+        "c,_=s.accept()"  # and ends with the request unread, as one that hangs and is killed
+    )
+    path = str(run_dir / "api.sock")
+    with subprocess.Popen([sys.executable, "-c", program, path], stdout=subprocess.PIPE) as server:
+        assert server.stdout is not None
+        server.stdout.readline()
+        result = avckpt("ps")
+    assert result.exit_code == 3
+    assert "Errno" not in result.stderr
+    assert "the sidecar went away (" in result.stderr
+
+
+@pytest.mark.parametrize("redirection", [">/dev/full", ">&-"])
+@pytest.mark.parametrize("command", ["check", "check --json", "completion bash", "--help"])
+def test_an_output_that_cannot_be_written(command: str, redirection: str, tmp_path: Path) -> None:
+    (tmp_path / "compose.yaml").write_text("services: {a: {image: x}}\n")
+    done = subprocess.run(
+        ["sh", "-c", f"{sys.executable} -m avckpt {command} {redirection}"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+    )
+    assert "Traceback" not in done.stderr
+    assert "Exception ignored" not in done.stderr
+    if redirection == ">/dev/full":
+        assert done.stderr == "avckpt: the output cannot be written: No space left on device\n"
+        assert done.returncode == 1
 
 
 def test_a_sidecar_that_was_killed_leaves_a_socket_that_is_no_sidecar(run_dir: Path) -> None:

@@ -107,7 +107,7 @@ def find(rows: list[Json], history: list[Json], name: str) -> tuple[Json, list[J
 
     Raises NoSuchContainer.
     """
-    rows = [row for row in rows if name == row["name"] or row["id"].startswith(name)]
+    rows = [row for row in rows if name == row["name"] or (name and row["id"].startswith(name))]
     names = {row["id"] for row in rows}
     events = [event for event in history if event["id"] in names or name == event["container"]]
     if not rows and not events:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, cast
 from urllib.parse import quote, urlencode
 
-from avckpt.errors import Denied, ProtocolError, SidecarUnreachable, from_json
+from avckpt.errors import Denied, NoSuchContainer, ProtocolError, SidecarUnreachable, from_json
 from avckpt.guard import Command
 
 Json = dict[str, Any]
@@ -24,8 +24,13 @@ COMMAND_S = 40.0
 ANSWER_S = 10.0
 """The same for what it knows without asking anybody; a busy machine may take some of that."""
 
+NAME_MOST = 500
+"""Characters of a name; the sidecar does not read longer paths than some 8000 bytes."""
+
 LOG = "its log (podman logs avckpt-sidecar)"
 SERVICE = "avckpt-sidecar.service"
+CONFIG_DIR = Path("/etc/avckpt")
+"""Made by `avckpt install`, as is the runtime directory."""
 UNITS = tuple(
     map(Path, ("/run/systemd/generator", "/etc/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system"))
 )
@@ -35,6 +40,8 @@ UNITS = tuple(
 def start_it(run_dir: Path) -> str:
     """How to start the sidecar here, as a clause: as a service of systemd where it is one, or else its container."""
     sudo = "" if os.geteuid() == 0 else "sudo "
+    if not CONFIG_DIR.is_dir():  # it is mounted, and Podman starts nothing without it
+        return f"install and start it with: {sudo}avckpt install && {sudo}{run_it(run_dir)}"
     if any((folder / SERVICE).exists() for folder in UNITS) and os.path.isdir("/run/systemd/system"):
         return f"start it with: {sudo}systemctl start {SERVICE}"
     return f"start it with: {sudo}{run_it(run_dir)}"
@@ -79,12 +86,12 @@ class Client:
     def inspect(self, name: str) -> Json:
         """All that is known about a container; returns {"container": ..., "settings": ..., "generations":
         ..., ...}."""
-        return self._request("GET", f"/v1/containers/{quote(name, safe='')}")
+        return self._request("GET", f"/v1/containers/{_quoted(name)}")
 
     def command(self, name: str, command: Command, generation: int = 0) -> Json:
         """Carries out a command; returns {"container": ..., "event": ...}."""
         query = f"?generation={generation}" if generation else ""
-        return self._request("POST", f"/v1/containers/{quote(name, safe='')}/{command.name.lower()}{query}")
+        return self._request("POST", f"/v1/containers/{_quoted(name)}/{command.name.lower()}{query}")
 
     def reload(self) -> Json:
         """Has the configuration file read again; returns {"config": ..., "containers": [...]}."""
@@ -146,9 +153,20 @@ class Client:
                 f"See {LOG}"
             ) from error
         except (OSError, http.client.HTTPException) as error:
-            raise SidecarUnreachable(f"the sidecar went away ({error}): see {LOG}") from error
+            # http.client's own errors have no errno, and a text that says it.
+            why = getattr(error, "strerror", None) or str(error)
+            raise SidecarUnreachable(f"the sidecar went away ({why.lower()}): see {LOG}") from error
         finally:
             connection.close()
+
+
+def _quoted(name: str) -> str:
+    """A name in a path.  Raises NoSuchContainer for what none can be called, and what would be another path."""
+    if not name:
+        raise NoSuchContainer("no container's name is empty: avckpt ps lists those there are")
+    if len(name) > NAME_MOST:
+        raise NoSuchContainer(f"no container is called {name[:20]!r}..., {len(name)} characters: see avckpt ps")
+    return quote(os.fsencode(name), safe="")
 
 
 class _UnixConnection(http.client.HTTPConnection):

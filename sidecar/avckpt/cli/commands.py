@@ -7,6 +7,7 @@ should start at once.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sys
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from avckpt_hooks.shared.tell import printable
 
 from avckpt import __version__
 from avckpt.cli.bundle import bundle
@@ -42,7 +44,20 @@ STATE_STYLES = {"protected": "green", "starting": "yellow", "restoring": "yellow
 
 
 class Cli(click.Group):
-    """Turns our errors into one line on stderr and the exit status that fits."""
+    """Turns our errors, and an output that cannot be written, into one line on stderr and the exit status that fits."""
+
+    def main(self, *args: Any, **more: Any) -> Any:
+        """Runs the command line."""
+        if sys.stdout is None:  # the caller has closed it
+            sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+        try:
+            return super().main(*args, **more)
+        except OSError as error:  # of a pipe whose reader has enough click takes care
+            what = "the output cannot be written" if error.filename is None else printable(str(error.filename))
+            click.echo(f"avckpt: {what}: {error.strerror or error}", err=True)
+            with contextlib.suppress(OSError):  # Python would try once more to write what is left
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            sys.exit(int(ExitCode.FAILED))
 
     def invoke(self, ctx: click.Context) -> Any:
         """Runs the command."""
