@@ -368,6 +368,14 @@ def test_uninstall_leaves_nothing_of_hooks_and_sidecar(root: Path) -> None:
         assert (folder / "history.jsonl").exists()
     assert install.uninstall(root)[:2] == ["nothing is installed", "removed /run/avckpt/history.jsonl"]
     assert install.uninstall(root) == ["nothing is installed"]
+    core = folder / "cores/web.1.core.zst"
+    core.parent.mkdir(parents=True)
+    core.touch()
+    assert install.uninstall(root)[1:] == [
+        "left /run/avckpt/cores: it holds 1 core file(s), with all that the programs knew"
+    ]
+    core.unlink()
+    assert install.uninstall(root)[1:] == ["removed /run/avckpt/cores", "removed /run/avckpt"]
     install.install(root)
     install.uninstall(root)
     assert tree(root) == before

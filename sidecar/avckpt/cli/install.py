@@ -270,8 +270,7 @@ def uninstall(root: Path = _HOST) -> list[str]:
     manifest = Manifest.read(root)
     callers = _callers(root)
     if manifest is None:
-        left = [] if callers else leftovers.remove(root, _run_dir())
-        return ["nothing is installed", *(f"removed {path}" for path in left)]
+        return ["nothing is installed", *([] if callers else _remove_leftovers(root))]
     naming = _naming_the_runtime(root)
     programs = (HOOK_PROGRAM, RUNTIME_PROGRAM)
     kept = [path for path in manifest.files if (callers or naming) and (path in programs or _PACKAGE in path.parents)]
@@ -280,7 +279,7 @@ def uninstall(root: Path = _HOST) -> list[str]:
     doomed = [path for path in (*reversed(manifest.files), MANIFEST) if path not in left]
     done = [f"removed {path}" for path in _remove_all(root, doomed)]
     if not callers:
-        done += [f"removed {path}" for path in leftovers.remove(root, _run_dir())]
+        done += _remove_leftovers(root)
     if kept:
         try:
             _record(root, kept, list(manifest.directories))
@@ -304,6 +303,16 @@ def uninstall(root: Path = _HOST) -> list[str]:
             done.append(f"left {path}: it holds other files")
         else:
             done.append(f"removed {path}")
+    return done
+
+
+def _remove_leftovers(root: Path) -> list[str]:
+    """What was done about what hooks and sidecars have left, a line each."""
+    done = [f"removed {path}" for path in leftovers.remove(root, _run_dir())]
+    cores = _run_dir() / leftovers.CORES
+    count = len(list(under(root, cores).glob("*")))
+    if count:
+        done.append(f"left {cores}: it holds {count} core file(s), with all that the programs knew")
     return done
 
 

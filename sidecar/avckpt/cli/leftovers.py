@@ -12,6 +12,8 @@ from pathlib import Path
 _FILES = ("history.jsonl", "history.jsonl.new", "present.json")
 _SOCKETS = ("api.sock", "hooks.sock", "units/units.sock")
 _FOLDERS = ("containers", "health", "units")
+CORES = "cores"
+"""What is in it stays: somebody has asked for it, and may not have looked at it yet."""
 _MOUNT_POINTS = (Path("/run/avckpt-init"), Path("/run/avckpt-units"))
 """The runtime makes them on the host for a container that has the host's /run (-v /run:/run)."""
 
@@ -29,7 +31,7 @@ def remove(root: Path, run_dir: Path) -> list[Path]:
         for name in (*_FILES, *_SOCKETS, *(f"{each}/*.json" for each in _FOLDERS), "lock"):
             for path in folder.glob(name):
                 removed += _unlink(path, socket=name in _SOCKETS)
-        removed += [path for each in (*_FOLDERS, "") for path in _rmdir(folder / each)]
+        removed += [path for each in (*_FOLDERS, CORES, "") for path in _rmdir(folder / each)]
     for point in _MOUNT_POINTS:
         place = root / point.relative_to("/")
         removed += [*_unlink(place, empty=True), *_rmdir(place)]
