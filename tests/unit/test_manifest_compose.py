@@ -89,6 +89,18 @@ def test_a_warning_that_podman_repeats_is_said_once() -> None:
     assert said == lines[:2]
 
 
+def test_what_the_hooks_refuse_is_told_in_their_words(tmp_path: Path) -> None:
+    said: list[str] = []
+    why = "container c: label avckpt.interval=5: a duration needs a unit"
+    failed = "executing [avckpt-hook precreate]: exit status 1"
+    script = f"echo 'avckpt: {why}'; echo 'level=warning msg=\"precreate hook: {failed}\"'; echo 'Error: {failed}'"
+    with pytest.raises(AvckptError) as failure:
+        Fake(f"{script}; exit 125").up([], said.append)
+    assert str(failure.value) == f"podman-compose up failed: {why}"
+    assert said == [f"avckpt: {why}"]
+    assert Fake(script).up([], said.append) == f"Error: {why}"
+
+
 def test_a_question_that_fails_is_told_as_podman_composes() -> None:
     compose = podman_compose.Compose([Path("compose.yaml")])
     compose._command = [sys.executable, "-c", "raise SystemExit('ValueError: bad mount')", "podman_compose"]

@@ -40,6 +40,8 @@ _HEALTHY = "--condition=healthy"
 _WAITS = {"--condition=running": "running", _HEALTHY: "healthy"}
 _ONE_WORD = re.compile(r"[\w.-]+")
 _NOT_THERE = ("Error: no container with name or ID", "Error: no pod with name or ID")
+_OF_HOOKS = "avckpt: container "
+_HOOK_FAILED = "executing [avckpt-hook "
 _WARNING = re.compile(r'(?:time="[^"]*" )?(level=warning .*)')
 _TRACEBACKS = ("Traceback (most recent call last):", "During handling of the above", "The above exception was")
 
@@ -205,13 +207,16 @@ class _Words:
     """The relevant output of podman-compose.
 
     Left out are names and ids of what was made or removed, that something was not there to be removed, a warning
-    that Podman repeats for each container, and of a traceback all but its last line.
+    that Podman repeats for each container, that a hook failed that has said why, and of a traceback all but its
+    last line.
     """
 
     def __init__(self, say: Say) -> None:
         self._say = say
         self._in_traceback = False
         self._warnings: set[str] = set()
+        self._refusal = ""
+        """What the hooks said last of a container; Podman adds no more to it than that a hook has failed."""
         self.last = ""
         self.error = ""
         """The last line that is an error of Podman's."""
@@ -225,7 +230,12 @@ class _Words:
                 output.seek(at)
                 return
             text = line.rstrip()
-            if text and not self._is_noise(text):
+            if text.startswith(_OF_HOOKS):
+                self._refusal = text.removeprefix("avckpt: ")
+            if self._refusal and _HOOK_FAILED in text:
+                self.last = self._refusal
+                self.error = f"Error: {self._refusal}"
+            elif text and not self._is_noise(text):
                 self.last = text
                 self.error = text if text.startswith("Error: ") else self.error
                 self._say(text)
