@@ -72,6 +72,7 @@ def test_who_sent_it() -> None:
     by_kernel = Death(5, {5: delivery(5, 9)}, [Sent(90, 9, 128, 99, 5, "app")])
     crash = crash_of("SIGKILL", by_kernel.fatal(9), by_kernel, None)
     assert (crash.code, crash.sender, crash.sender_pid) == ("SI_KERNEL", "kernel", 0)
+    assert str(Crash(signal="SIGSEGV", sender_pid=77)) == "SIGSEGV, sent by a process that has ended (77)"
 
 
 def test_names_of_threads_and_senders_control_no_terminal() -> None:

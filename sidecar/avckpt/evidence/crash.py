@@ -78,7 +78,7 @@ class Crash:
         where = f" at {self.at}" if self.at else ""
         thread = f" in thread {self.thread}" if self.thread else ""
         fault = f" (access to {self.fault})" if self.fault else ""
-        sender = f", sent by {self.sender or 'process'} ({self.sender_pid})" if self.sender_pid else ""
+        sender = f", sent by {self.sender or 'a process that has ended'} ({self.sender_pid})" if self.sender_pid else ""
         sender = ", sent by the kernel" if self.sender == "kernel" else sender
         code = f" {self.code}" if self.code else ""
         return f"{self.signal}{code}{fault}{thread}{where}{sender}" if self.signal else ""
