@@ -7,7 +7,7 @@
  * holds anything else is a violation, and so is memory of another moment than the registers.  It
  * writes pages, gives some back (MADV_DONTNEED) and protects some for a while.  With --maps it also
  * unmaps and maps again, moves mappings, grows and shrinks the heap, has mappings that come and go or
- * stay, guard pages, and deep stacks.  KB_PER_S (0: as fast as it can) of all threads together.
+ * stay, guard pages, pages of a file that it writes and gives back, and deep stacks.  KB_PER_S (0: as fast as it can) of all threads together.
  */
 #include <pthread.h>
 #include <sys/mman.h>
@@ -26,7 +26,8 @@ enum {
 	DEPTH_MAX = 24,
 	NAP_US = 1000,
 	BLOCKS = 8,
-	BLOCK_PAGES_MAX = 96
+	BLOCK_PAGES_MAX = 96,
+	FILE_PAGES = 64
 };
 
 static size_t part_pages;
@@ -44,6 +45,7 @@ struct block {
 struct part {
 	int index;
 	struct block block[BLOCKS];
+	uint64_t *file, file_stamp[FILE_PAGES]; /* mapped privately; 0: as in the file    */
 	uint64_t *heap_at, heap_stamp; /* of the first part: what the heap has grown by     */
 	uint64_t random, stamps, laps;
 	char *memory;
@@ -210,6 +212,42 @@ static void check_filled(const uint64_t *at, size_t pages, uint64_t stamp)
 		      at[i * WORDS]);
 }
 
+static void map_file(struct part *part)
+{
+	FILE *file = tmpfile();
+
+	must(file != NULL, "tmpfile");
+	for (uint64_t i = 0; i < FILE_PAGES; i++)
+		must(pwrite(fileno(file), &i, sizeof i, (off_t)(i * PAGE)) == sizeof i, "pwrite");
+	must(!ftruncate(fileno(file), (off_t)FILE_PAGES * PAGE), "ftruncate");
+	part->file = mmap(NULL, (size_t)FILE_PAGES * PAGE, PROT_READ | PROT_WRITE, MAP_PRIVATE,
+			  fileno(file), 0);
+	must(part->file != MAP_FAILED, "mmap");
+	fclose(file);
+}
+
+static void change_file(struct part *part)
+{
+	const uint64_t stamp = next_random(&part->random);
+	const size_t first = stamp % FILE_PAGES;
+	size_t pages = 1 + (stamp >> 8) % RUN_MAX;
+
+	if (pages > FILE_PAGES - first)
+		pages = FILE_PAGES - first;
+	for (size_t i = first; i < first + pages; i++) {
+		const uint64_t expected = part->file_stamp[i] ? part->file_stamp[i] : i;
+
+		CHECK(part->file[i * WORDS] == expected, "page %zu of a file holds %lx", i,
+		      part->file[i * WORDS]);
+	}
+	if (stamp >> 63) {
+		must(!madvise(part->file + first * WORDS, pages * PAGE, MADV_DONTNEED), "madvise");
+		memset(part->file_stamp + first, 0, pages * sizeof *part->file_stamp);
+	} else {
+		part->file[first * WORDS] = part->file_stamp[first] = stamp;
+	}
+}
+
 /* As malloc(3) does: a block comes, grows, is protected, goes. */
 static void change_block(struct part *part)
 {
@@ -279,7 +317,7 @@ static void change_maps(struct part *part)
 {
 	const uint64_t stamp = next_random(&part->random);
 
-	switch (stamp % 8) {
+	switch (stamp % 9) {
 	case 0:
 		map_again(part);
 		return;
@@ -302,6 +340,9 @@ static void change_maps(struct part *part)
 	case 6:
 		if (!part->index)
 			step_heap(part);
+		return;
+	case 7:
+		change_file(part);
 		return;
 	default:
 		CHECK(dive((int)((stamp >> 8) % DEPTH_MAX), stamp) == stamp, "the stack is torn");
@@ -379,6 +420,8 @@ int main(int argc, char **argv)
 		must(part->expected != NULL, "calloc");
 		for (size_t k = 0; k < part_pages; k++)
 			write_page(part, k);
+		if (with_maps)
+			map_file(part);
 	}
 	for (int i = 1; i < threads; i++) {
 		pthread_t thread;

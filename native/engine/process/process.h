@@ -208,10 +208,13 @@ struct tracker {
 	struct stretch {
 		avc_remote start, end;
 	} * area;
+	uint32_t files, file_room; /* those of files                                      */
+	struct stretch *file;
 	uint64_t scanned_ns;       /* when the last scan ended                           */
 	uint32_t parts, part_room; /* where they have pages of their own, in chunks       */
 	struct stretch *part;
 	struct pageset found;
+	struct pageset of_files; /* pages of private mappings of files, found in a scan   */
 	struct pageset *set[TRACKER_SETS];
 	uint32_t sets;
 	bool over;   /* its process has ended                                   */

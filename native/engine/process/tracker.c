@@ -34,6 +34,7 @@
 #ifndef UFFD_FEATURE_WP_ASYNC
 #define UFFD_FEATURE_WP_ASYNC (1 << 15)
 #endif
+#define PAGE ((avc_remote)ARCH_PAGE_BYTES)
 #define MAKE_NS NS_PER_S
 #define HAND_OVER_S 1 /* for so long a task waits for the watcher                */
 
@@ -194,7 +195,9 @@ void tracker_end(struct process *process)
 	close_fd(&tracker->uffd);
 	close_fd(&tracker->pagemap);
 	pageset_free(&tracker->found);
+	pageset_free(&tracker->of_files);
 	free(tracker->area);
+	free(tracker->file);
 	free(tracker->part);
 	free(tracker);
 }
@@ -205,6 +208,14 @@ struct watch {
 	struct tracker *tracker;
 	struct stretch refused; /* one that cannot be, or was gone just then             */
 };
+
+static bool add_file(struct tracker *tracker, avc_remote start, avc_remote end)
+{
+	if (!make_room(&tracker->file, tracker->files, &tracker->file_room, sizeof *tracker->file))
+		return false;
+	tracker->file[tracker->files++] = (struct stretch){ start, end };
+	return true;
+}
 
 static bool add_area(struct tracker *tracker, avc_remote start, avc_remote end)
 {
@@ -251,6 +262,8 @@ static int watch_mapping(const struct mapping *m, void *arg)
 		watch->refused = (struct stretch){ m->start, m->end };
 		return 0;
 	}
+	if (m->inode && !add_file(watch->tracker, m->start, m->end))
+		return -1;
 	return add_area(watch->tracker, m->start, m->end) ? 0 : -1;
 }
 
@@ -271,7 +284,7 @@ int tracker_watch(struct process *process, char *layout, struct avc_error *err)
 	FILE *text = fmemopen(layout, strlen(layout), "r");
 	int result;
 
-	process->tracker->areas = 0;
+	process->tracker->areas = process->tracker->files = 0;
 	result = text ? proc_parse_mappings(text, false, watch_mapping, &watch) : -1;
 	if (text)
 		fclose(text);
@@ -366,6 +379,56 @@ static int find_parts(struct tracker *tracker, int pagemap)
 	return 0;
 }
 
+/* ---- private mappings of files ------------------------------------------------------------- */
+
+/* Of what was found written; both are in order. */
+static bool keep_found(struct tracker *tracker)
+{
+	struct page_cursor at = { 0 };
+	avc_remote start, end;
+	uint32_t i = 0;
+
+	while (pageset_next(&tracker->found, &at, &start, &end)) {
+		while (i < tracker->files && tracker->file[i].end <= start)
+			i++;
+		for (uint32_t k = i; k < tracker->files && tracker->file[k].start < end; k++) {
+			const struct stretch *file = &tracker->file[k];
+
+			if (!pageset_add(&tracker->of_files,
+					 file->start > start ? file->start : start,
+					 file->end < end ? file->end : end))
+				return false;
+		}
+	}
+	return true;
+}
+
+/* madvise(MADV_DONTNEED) gives back a page of its own but leaves the mark
+ * (zap_install_uffd_wp_if_needed() in mm/memory.c): that does not count as written.  So the pages
+ * that it had are looked up. */
+static bool find_given_back(struct tracker *tracker)
+{
+	struct pageset had = tracker->of_files;
+	uint64_t entry[PAGESET_PAGES];
+	struct page_cursor at = { 0 };
+	avc_remote start, end;
+	bool done = true;
+
+	tracker->of_files = (struct pageset){ 0 };
+	while (done && pageset_next(&had, &at, &start, &end)) {
+		const size_t bytes = (end - start) / PAGE * sizeof *entry;
+
+		done = pread(tracker->pagemap, entry, bytes,
+			     (off_t)(start / PAGE * sizeof *entry)) == (ssize_t)bytes;
+		for (size_t i = 0; done && start < end; i++, start += PAGE)
+			done = pageset_add(page_is_own(entry[i]) ? &tracker->of_files
+								 : &tracker->found,
+					   start, start + PAGE);
+	}
+	pageset_free(&had);
+	return done;
+}
+
 /* ---- scans --------------------------------------------------------------------------------- */
 
 static int note(avc_remote start, avc_remote end, void *arg)
@@ -394,6 +457,7 @@ int tracker_scan(struct tracker *tracker, pid_t template, uint64_t *pages)
 	tracker->found.count = 0;
 	for (uint32_t i = 0; !result && i < tracker->areas; i++)
 		result = each(tracker, &tracker->area[i], true, look_for_written, tracker->pagemap);
+	tracker->broken |= !keep_found(tracker) || !find_given_back(tracker);
 	*pages = pageset_count(&tracker->found);
 	tracker->scanned_ns = now_ns();
 	for (uint32_t i = 0; i < tracker->sets; i++)
