@@ -74,6 +74,7 @@ def until_copied(guard: GuardProcess, tries: int = 60) -> Json:
         "dirt 30 4 --rate 20000",
         "dirt 32 2 --rate 30000 --maps",
         "dirt 8 2",
+        "dirt 34 1 --rate 4000 --grows",
         "threads 20 16",
         "rseq 4",
         "signals 6 --pending",

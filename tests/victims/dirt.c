@@ -1,13 +1,15 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * dirt MB THREADS [--rate KB_PER_S] [--maps]: memory that is written at random, all the
+ * dirt MB THREADS [--rate KB_PER_S] [--maps] [--grows]: memory that is written at random, all the
  * time, and read again.
  *
  * Each thread has a part of MB, and a table that says what stands in each page of it; a page that
  * holds anything else is a violation, and so is memory of another moment than the registers.  It
  * writes pages, gives some back (MADV_DONTNEED) and protects some for a while.  With --maps it also
  * unmaps and maps again, moves mappings, grows and shrinks the heap, has mappings that come and go or
- * stay, guard pages, pages of a file that it writes and gives back, and deep stacks.  KB_PER_S (0: as fast as it can) of all threads together.
+ * stay, guard pages, pages of a file that it writes and gives back, and deep stacks.  With --grows
+ * a mapping of its own grows downwards (MAP_GROWSDOWN).  KB_PER_S (0: as fast as it can) of all
+ * threads together.
  */
 #include <pthread.h>
 #include <sys/mman.h>
@@ -27,13 +29,14 @@ enum {
 	NAP_US = 1000,
 	BLOCKS = 8,
 	BLOCK_PAGES_MAX = 96,
-	FILE_PAGES = 64
+	FILE_PAGES = 64,
+	GROWN_MAX = 4096
 };
 
 static size_t part_pages;
 static int threads;
 static uint64_t rate;
-static bool with_maps;
+static bool with_maps, grows;
 
 /* A mapping that stays for a while. */
 struct block {
@@ -248,6 +251,29 @@ static void change_file(struct part *part)
 	}
 }
 
+/* By one page, as by a thread whose stack that is. */
+static void grow_down(void)
+{
+	static char *top;
+	static uint64_t pages;
+
+	if (!top) {
+		top = mmap((void *)0x500000000000, PAGE, PROT_READ | PROT_WRITE,
+			   MAP_PRIVATE | MAP_ANONYMOUS | MAP_GROWSDOWN, -1, 0);
+		must(top != MAP_FAILED, "mmap");
+		top += PAGE;
+	}
+	if (pages < GROWN_MAX) {
+		pages++;
+		*(volatile uint64_t *)(top - pages * PAGE) = pages;
+	}
+	for (uint64_t i = 1; i <= pages; i++) {
+		const uint64_t holds = *(uint64_t *)(top - i * PAGE);
+
+		CHECK(holds == i, "page %lu of what grows holds %lx", i, holds);
+	}
+}
+
 /* As malloc(3) does: a block comes, grows, is protected, goes. */
 static void change_block(struct part *part)
 {
@@ -389,6 +415,8 @@ static void *work(void *arg)
 			steps = due - 4096;
 		for (; steps < due; steps++)
 			step(part);
+		if (!part->index && grows)
+			grow_down();
 		if (!part->index)
 			beat();
 		if (rate)
@@ -403,7 +431,8 @@ int main(int argc, char **argv)
 	pthread_attr_t attr;
 
 	with_maps = victim_flag(&argc, argv, "--maps");
-	victim_start(&argc, argv, 2, "MB THREADS [--rate KB_PER_S] [--maps]");
+	grows = victim_flag(&argc, argv, "--grows");
+	victim_start(&argc, argv, 2, "MB THREADS [--rate KB_PER_S] [--maps] [--grows]");
 	if (argc > 4 && !strcmp(argv[3], "--rate"))
 		rate = strtoull(argv[4], NULL, 10);
 	threads = atoi(argv[2]) < THREADS_MAX ? atoi(argv[2]) : THREADS_MAX;

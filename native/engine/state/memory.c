@@ -264,7 +264,7 @@ bool memory_needs_fork(const struct process *process)
 	for (uint32_t i = 0; i < memory->kinds.count; i++)
 		if (memory->kinds.area[i].flags & (MAPPING_KEYS | MAPPING_TAGGED))
 			return true;
-	return memory->dontfork;
+	return memory->dontfork || memory->grows;
 }
 
 /* ---- mappings, from /proc ------------------------------------------------------------ */

@@ -75,6 +75,7 @@ struct memory {
 	struct marks locked;
 	struct marks kinds; /* as mem_image.kinds                              */
 	bool special;       /* the same                                        */
+	bool grows;         /* some, other than its stack, grows downwards     */
 	int64_t locked_kb;
 	uint64_t locked_layout, locked_read_ns, locked_cost_ns;
 };

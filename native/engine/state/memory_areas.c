@@ -201,6 +201,8 @@ static int find_area(const struct mapping *m, void *arg)
 	if (!is_of_parasite(survey->process, m->start)) {
 		marks_add(&survey->memory->kinds, m, kind_of(survey, m));
 		survey->memory->special |= mapping_is_special(m);
+		survey->memory->grows |= m->flags & MAPPING_GROWING &&
+					 strcmp(m->name, "[stack]") != 0;
 		if (survey->process->descendant || survey->recycled)
 			marks_add(&survey->memory->advised, m, advice_of(m));
 	}
@@ -341,7 +343,7 @@ static int read_areas(struct survey *survey, const struct areas *copied, struct 
 	int result = 0;
 
 	memory->advised.count = memory->kinds.count = 0;
-	memory->special = false;
+	memory->special = memory->grows = false;
 	/* Advice given to the process since its template was forked is missing in the template. */
 	if (proc_mappings(survey->recycled ? pid : survey->template, "smaps", find_area, survey))
 		return fail_errno(err, survey->template, "keep memory", "read(smaps)",

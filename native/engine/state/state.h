@@ -277,7 +277,7 @@ int memory_learn(struct process *process, long missing_pages, struct avc_error *
 extern const char memory_private_huge_pages[];
 int memory_finish(struct image *image, int64_t locked_kb, struct setup *setup,
 		  struct avc_error *err) warn_unused;
-/* Whether only a fork preserves its properties: advice, protection keys. */
+/* Whether only a fork preserves its properties: advice, protection keys, growth. */
 bool memory_needs_fork(const struct process *process);
 /* When all exist: -1 if several processes have shared memory that is not rolled back with them.  One
  * that goes back would wait for what another one has done already. */
