@@ -10,7 +10,9 @@ import random
 import re
 import select
 import signal
+import subprocess
 import time
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from avckpt.guard import Images
 from testkit.family import ours
 from testkit.guarded import (
     PATIENCE_S,
+    WHERE,
     GuardProcess,
     Json,
     Victim,
@@ -91,6 +94,32 @@ def test_killed_at_random_moments(command: str, tmp_path: Path) -> None:
             guard.wait("checkpoint", since=since, count=4)
             kill_at_random(guard, victim, 2, (0.0, 0.4), seed=seed)
         victim.wait_beats(20)
+
+
+@pytest.fixture
+def slow_file(tmp_path: Path, victims_built: Path) -> Iterator[Path]:
+    """What is read from it arrives late, in pages that the kernel has looked up before."""
+    command = [str(victims_built / "server"), str(tmp_path), "nobody", "--slow"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        if process.stdout.readline() != b"ready\n":
+            pytest.skip("/dev/fuse is not available here")
+        yield tmp_path / "mount/served"
+        process.kill()
+    subprocess.run(["umount", "-l", tmp_path / "mount"], check=True)
+
+
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("how", ["", "--again"])
+def test_what_a_file_server_writes_late(how: str, where: str, slow_file: Path, tmp_path: Path) -> None:
+    with (
+        Victim(f"served {slow_file} {how} {where}", tmp_path) as victim,
+        GuardProcess(BY_ITSELF, [victim.pid]) as guard,
+    ):
+        for _ in range(6):
+            guard.wait_for(lambda event: event.get("images") == "dirty", "copies", since=guard.mark(), count=3)
+            kill_at_random(guard, victim, 1, (0.0, 0.0))
+        victim.check()
 
 
 @pytest.mark.parametrize("command", ["dirt 60 4 --rate 20000", "dirt 64 2 --rate 30000 --maps", "busy 4"])

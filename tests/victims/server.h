@@ -1,6 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * A file server of one file (FUSE), which does not answer one program.
+ * A file server of one file (FUSE), which does not answer one program.  If it is slow, it takes a
+ * while for each read, into the pages of whoever reads, and each finds other contents.
  */
 #ifndef SERVER_H
 #define SERVER_H
@@ -15,6 +16,9 @@
 #define SERVED_BYTES 4096
 #define ROOT_INODE 1
 #define SERVED_INODE 2
+#define SLOW_US 3000
+
+static bool server_is_slow;
 
 static inline struct fuse_attr server_attr(uint64_t inode)
 {
@@ -61,7 +65,7 @@ static inline bool server_is_asked_by(const struct fuse_in_header *in, const cha
 
 static inline void server_answer_to(int device, const struct fuse_in_header *in)
 {
-	static char content[SERVED_BYTES];
+	static uint64_t content[SERVED_BYTES / sizeof(uint64_t)];
 	const struct fuse_init_out init = {
 		.major = FUSE_KERNEL_VERSION,
 		.minor = FUSE_KERNEL_MINOR_VERSION,
@@ -78,7 +82,10 @@ static inline void server_answer_to(int device, const struct fuse_in_header *in)
 		.attr_valid = 3600,
 		.attr = server_attr(in->nodeid),
 	};
-	const struct fuse_open_out opened = { .fh = 1 };
+	const struct fuse_open_out opened = {
+		.fh = 1,
+		.open_flags = server_is_slow ? FOPEN_DIRECT_IO : 0,
+	};
 
 	switch (in->opcode) {
 	case FUSE_INIT:
@@ -95,6 +102,10 @@ static inline void server_answer_to(int device, const struct fuse_in_header *in)
 		server_answer(device, in->unique, 0, &opened, sizeof opened);
 		break;
 	case FUSE_READ:
+		if (server_is_slow)
+			nap_us(SLOW_US);
+		for (size_t i = 0; server_is_slow && i < sizeof content / sizeof *content; i++)
+			content[i]++;
 		server_answer(device, in->unique, 0, content, sizeof content);
 		break;
 	case FUSE_FLUSH:

@@ -96,6 +96,20 @@ static uint64_t expected(uint64_t written, uint64_t before_ns, uint64_t since_ns
 			 : written;
 }
 
+/* *reading: how many pages are being read into, and have to be copied again. */
+static bool copy_round(struct dirty *dirty, const struct process *process, uint64_t *reading)
+{
+	struct pageset reads = { 0 };
+	bool known = reads_under_way(process, &reads);
+
+	*reading = pageset_count(&reads);
+	copy_stale(dirty, process);
+	known = pageset_add_all(dirty->idle.stale, &reads) && known;
+	process->tracker->broken |= !known;
+	pageset_free(&reads);
+	return !process->tracker->broken;
+}
+
 /* Until a round leaves little, or hardly less than the one before.  *left: how much.  A scan takes
  * time by the size of the process, and is not made if it would find little. */
 static bool copy_rounds(struct dirty *dirty, const struct attempt *attempt, uint64_t *left)
@@ -105,7 +119,7 @@ static bool copy_rounds(struct dirty *dirty, const struct attempt *attempt, uint
 
 	for (int i = 0; i < ROUNDS; i++) {
 		const uint64_t last_ns = process->tracker->scanned_ns;
-		uint64_t scanned_ns, soon;
+		uint64_t scanned_ns, soon, reading;
 
 		if (!scan(dirty, attempt, i ? 0 : dirty->idle.pid, left))
 			return false;
@@ -114,10 +128,10 @@ static bool copy_rounds(struct dirty *dirty, const struct attempt *attempt, uint
 			return false;
 		}
 		scanned_ns = process->tracker->scanned_ns;
-		copy_stale(dirty, process);
-		if (process->tracker->broken)
+		if (!copy_round(dirty, process, &reading))
 			return false;
-		soon = expected(*left, scanned_ns - last_ns, now_ns() - scanned_ns);
+		soon = expected(*left, scanned_ns - last_ns, now_ns() - scanned_ns) + reading;
+		*left += reading;
 		if (soon <= FEW_PAGES) {
 			*left = soon;
 			break;

@@ -5,6 +5,7 @@
  *   dirty_tree.c      all processes
  *   dirty.c           one of them: whether, when, and which pages
  *   dirty_copy.c      copies them
+ *   dirty_reads.c     which may still be written unseen
  *   dirty_template.c  calls made by the template, so that its mappings become the process's
  *   stand_in.c        replaces a template whose memory a restore takes
  */
@@ -84,5 +85,10 @@ bool copy_read(struct dirty *dirty, const struct process *process);
 /* When it runs again: writes to the template what was read. */
 int copy_write(struct dirty *dirty, struct template_calls *calls,
 	       struct avc_error *err) warn_unused;
+
+/* ---- dirty_reads.c ----------------------------------------------------------------------------- */
+
+/* Adds the pages that its threads are reading files into.  False: not all could be. */
+bool reads_under_way(const struct process *process, struct pageset *pages) warn_unused;
 
 #endif
