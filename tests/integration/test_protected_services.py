@@ -164,7 +164,7 @@ def test_redis_keeps_its_client_and_its_data(sidecar: Sidecar, container: Contai
     for n in range(200):
         assert peer.redis("SET", f"key:{n}", f"value {n}") == b"+OK"
     assert peer.redis("INCRBY", "counter", "41") == b":41"
-    sidecar.avckpt("checkpoint", made.name)
+    take_checkpoint(sidecar.client, made.name)
     assert peer.redis("SET", "late", "lost") == b"+OK"
     for n in range(1, 4):
         os.kill(sidecar.app_pid(made), signal.SIGKILL)

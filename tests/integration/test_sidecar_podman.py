@@ -15,7 +15,7 @@ from avckpt.cli import doctor, sidecar_container
 from avckpt.cli.client import Client
 from avckpt.errors import SidecarUnreachable
 
-from testkit.harness import CONFIG_DIR, RUN_DIR, SIDECAR_IMAGE, SIDECAR_NAME, wait_until
+from testkit.harness import CONFIG_DIR, RUN_DIR, SIDECAR_IMAGE, SIDECAR_NAME, take_checkpoint, wait_until
 from testkit.protected import told
 
 pytestmark = pytest.mark.shared_machine(
@@ -167,7 +167,7 @@ def test_a_renamed_container_is_known_by_its_new_name(
     podman.run("rename", made.name, anew)
     try:
         wait_until(lambda: (sidecar.find(made) or {})["name"] == anew, 20, "the new name is known")
-        assert sidecar.avckpt("checkpoint", anew).status == 0
+        take_checkpoint(sidecar.client, anew)
     finally:
         podman.run("rename", anew, made.name)
 

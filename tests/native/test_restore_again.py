@@ -106,8 +106,8 @@ def test_threads_go_on_at_random_times_at_the_second_try_and_only_then(tmp_path:
             seen = victim.see().counter
             apart_ms[event.get("again", "")].append(abs(seen[2] - seen[3]) / 1e6)
         assert [len(each) for each in apart_ms.values()] == [PAIRS, PAIRS]
-        assert statistics.median(apart_ms[""]) < 1, apart_ms
-        assert statistics.median(apart_ms["stagger"]) > 1, apart_ms
+        # A pause of up to 20 ms for each, beside what the machine takes to wake both.
+        assert statistics.median(apart_ms["stagger"]) > 2 * statistics.median(apart_ms[""]), apart_ms
 
 
 def have_woken(victim: Victim, times: int) -> bool:
