@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pytest
 from avckpt.cli import client, commands
@@ -102,30 +104,29 @@ def test_no_name_is_no_beginning_of_an_id() -> None:
         find([row()], [], "")
 
 
-def test_a_name_that_is_no_text(run_dir: Path) -> None:
-    program = (
-        "import socket,sys; s=socket.socket(socket.AF_UNIX); s.bind(sys.argv[1]); s.listen(); print(flush=True);"
-        "c,_=s.accept(); print(c.recv(9999).split()[1].decode(), flush=True); c.close()"
-    )
-    path = str(run_dir / "api.sock")
-    with subprocess.Popen([sys.executable, "-c", program, path], stdout=subprocess.PIPE) as server:
+@contextlib.contextmanager
+def in_its_place(program: str, run_dir: Path) -> Iterator[IO[bytes]]:
+    """A program where the sidecar should be, which has the socket `s`; what it says."""
+    listen = "import socket,sys; s=socket.socket(socket.AF_UNIX); s.bind(sys.argv[1]); s.listen(); print(flush=True);"
+    command = [sys.executable, "-c", listen + program, str(run_dir / "api.sock")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as server:
         assert server.stdout is not None
         server.stdout.readline()
+        yield server.stdout
+
+
+def test_a_name_that_is_no_text(run_dir: Path) -> None:
+    program = "c,_=s.accept(); print(c.recv(9999).split()[1].decode(), flush=True); c.close()"
+    with in_its_place(program, run_dir) as said:
         result = avckpt("inspect", os.fsdecode(b"\xff/"))
-        assert server.stdout.readline() == b"/v1/containers/%FF%2F\n"
+        assert said.readline() == b"/v1/containers/%FF%2F\n"
     assert result.exit_code == 3
     assert "the sidecar went away (" in result.stderr
 
 
 def test_a_sidecar_that_dies_meanwhile_is_told_in_words(run_dir: Path) -> None:
-    program = (
-        "import socket,sys; s=socket.socket(socket.AF_UNIX); s.bind(sys.argv[1]); s.listen(); print(flush=True);"
-        "c,_=s.accept()"  # and ends with the request unread, as one that hangs and is killed
-    )
-    path = str(run_dir / "api.sock")
-    with subprocess.Popen([sys.executable, "-c", program, path], stdout=subprocess.PIPE) as server:
-        assert server.stdout is not None
-        server.stdout.readline()
+    program = "c,_=s.accept()"  # and ends with the request unread, as one that hangs and is killed
+    with in_its_place(program, run_dir):
         result = avckpt("ps")
     assert result.exit_code == 3
     assert "Errno" not in result.stderr
@@ -158,14 +159,8 @@ def test_a_sidecar_that_was_killed_leaves_a_socket_that_is_no_sidecar(run_dir: P
 
 
 def test_an_answer_that_is_no_sidecars(run_dir: Path) -> None:
-    program = (
-        "import socket,sys; s=socket.socket(socket.AF_UNIX); s.bind(sys.argv[1]); s.listen(); print(flush=True);"
-        "c,_=s.accept(); c.recv(9999); c.sendall(b'HTTP/1.0 200 OK\\r\\n\\r\\n[1]'); c.close()"
-    )
-    path = str(run_dir / "api.sock")
-    with subprocess.Popen([sys.executable, "-c", program, path], stdout=subprocess.PIPE) as server:
-        assert server.stdout is not None
-        server.stdout.readline()
+    program = "c,_=s.accept(); c.recv(9999); c.sendall(b'HTTP/1.0 200 OK\\r\\n\\r\\n[1]'); c.close()"
+    with in_its_place(program, run_dir):
         result = avckpt("ps")
     assert result.exit_code == 1
     assert "is invalid" in result.stderr

@@ -151,7 +151,8 @@ int generation_files_error(const struct generation *generation, struct avc_error
  * shares the table, and lives. */
 void generation_close_files(const struct image *image, bool shared);
 /* The same for all processes but the main one, once they are restored and have descriptors of their
- * own: before they continue, because what they close must be closed; `late` what is left (files_late.c). */
+ * own: before they continue, because what they close must be closed; `late`: what is left
+ * (files_late.c). */
 void generation_close_tables(const struct generation *generation, bool late);
 
 /* ---- layout.c ------------------------------------------------------------------ */

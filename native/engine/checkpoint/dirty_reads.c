@@ -4,7 +4,6 @@
  * pages itself (O_DIRECT, FUSE, 9p), they are looked up, and so marked as written, when the call
  * begins.  What arrives after a scan and a copy is not noticed any more: such pages stay stale.
  */
-#include <fcntl.h>
 #include <stdio.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
@@ -23,11 +22,11 @@ struct reads {
 
 static bool is_file(pid_t pid, uint64_t number)
 {
-	char path[64];
+	char name[24];
 	struct statx st;
 
-	snprintf(path, sizeof path, "/proc/%d/fd/%u", pid, (unsigned int)number);
-	return statx(AT_FDCWD, path, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT, STATX_TYPE, &st) == 0 &&
+	snprintf(name, sizeof name, "fd/%u", (unsigned int)number);
+	return proc_look(pid, name, STATX_TYPE, &st) &&
 	       (S_ISREG(st.stx_mode) || S_ISBLK(st.stx_mode));
 }
 

@@ -45,23 +45,24 @@ static bool makes_socket(const struct files_work *work)
 	return false;
 }
 
-/* What goes on is the application's alone, from now on. */
-static bool close_kept(const struct files_work *work, struct inj_call *call)
+/* All but those that are `closed` already (NULL: none is), in ranges.  False: `more` calls would have no
+ * room after them. */
+static bool close_all(struct inj_call *call, const struct files *files, const bool *closed,
+		      uint32_t more)
 {
-	const struct files *now = work->now;
 	uint32_t next;
 
-	for (uint32_t i = 0; i < now->count; i = next) {
+	for (uint32_t i = 0; i < files->count; i = next) {
 		next = i + 1;
-		if (work->closed[i])
+		if (closed && closed[i])
 			continue;
-		while (next < now->count && !work->closed[next] &&
-		       now->file[next].fd == now->file[next - 1].fd + 1)
+		while (next < files->count && !(closed && closed[next]) &&
+		       files->file[next].fd == files->file[next - 1].fd + 1)
 			next++;
-		if (call->count == INJ_CALLS_MAX - 2)
+		if (call->count == INJ_CALLS_MAX - more)
 			return false;
-		call_add(call, SYS_close_range, (uint64_t)now->file[i].fd,
-			 (uint64_t)now->file[next - 1].fd);
+		call_add(call, SYS_close_range, (uint64_t)files->file[i].fd,
+			 (uint64_t)files->file[next - 1].fd);
 	}
 	return true;
 }
@@ -150,7 +151,8 @@ void files_take_late(const struct files_work *work)
 	if (call->call[0].result)
 		return;
 	call_begin(call, INJ_AFTER_PARK);
-	if (close_kept(work, call)) {
+	/* What goes on is the application's alone, from now on. */
+	if (close_all(call, work->now, work->closed, 2)) {
 		call_add(call, INJ_CLOSE_CLAIMS, 0, looked_at - 1);
 		call_add(call, SYS_close_range, looked_at, ~0u);
 		process->late = start(process) == 0;
@@ -177,19 +179,9 @@ bool files_start_closing(const struct process *process)
 bool files_start_closing_claims(const struct process *process, const struct files *had)
 {
 	struct inj_call *call = &process->parasite.control->holder;
-	uint32_t next;
 
 	call_begin(call, INJ_AFTER_PARK);
-	for (uint32_t i = 0; i < had->count; i = next) {
-		next = i + 1;
-		while (next < had->count && had->file[next].fd == had->file[next - 1].fd + 1)
-			next++;
-		if (call->count == INJ_CALLS_MAX)
-			return files_start_closing(process);
-		call_add(call, SYS_close_range, (uint64_t)had->file[i].fd,
-			 (uint64_t)had->file[next - 1].fd);
-	}
-	return start(process) == 0;
+	return close_all(call, had, NULL, 0) ? start(process) == 0 : files_start_closing(process);
 }
 
 void files_close_late(const struct process *process)

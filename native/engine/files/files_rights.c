@@ -61,14 +61,26 @@ static bool is_user(uint32_t user, uint32_t group)
 	       (uint32_t)syscall(SYS_setfsgid, -1) == group;
 }
 
-int file_rights_take(const struct file_rights *rights, struct file_rights_own *own)
+static int take_groups(const struct file_rights *rights, struct file_rights_own *own)
 {
 	if (!rights->known)
 		return -1;
+	own->group_count = (int)syscall(SYS_getgroups, RIGHTS_GROUPS, own->groups);
+	return own->group_count < 0 || syscall(SYS_setgroups, rights->group_count, rights->groups)
+		       ? -1
+		       : 0;
+}
+
+static void give_groups_back(const struct file_rights_own *own)
+{
+	(void)syscall(SYS_setgroups, own->group_count, own->groups);
+}
+
+int file_rights_take(const struct file_rights *rights, struct file_rights_own *own)
+{
 	own->user = (uint32_t)syscall(SYS_setfsuid, -1);
 	own->group = (uint32_t)syscall(SYS_setfsgid, -1);
-	own->group_count = (int)syscall(SYS_getgroups, RIGHTS_GROUPS, own->groups);
-	if (own->group_count < 0 || syscall(SYS_setgroups, rights->group_count, rights->groups))
+	if (take_groups(rights, own))
 		return -1;
 	set_user(rights->user, rights->group);
 	if (set_effective(rights->caps) || !is_user(rights->user, rights->group)) {
@@ -83,7 +95,7 @@ void file_rights_give_back(const struct file_rights_own *own)
 {
 	set_user(own->user, own->group);
 	(void)set_effective(~UINT64_C(0));
-	(void)syscall(SYS_setgroups, own->group_count, own->groups);
+	give_groups_back(own);
 }
 
 static void set_effective_user(uint32_t user, uint32_t group)
@@ -103,9 +115,7 @@ int file_rights_pair(const struct file_rights *rights, int type, int ends[2])
 				       .group = (uint32_t)syscall(SYS_getegid) };
 	int result = -1;
 
-	own.group_count = (int)syscall(SYS_getgroups, RIGHTS_GROUPS, own.groups);
-	if (!rights->known || own.group_count < 0 ||
-	    syscall(SYS_setgroups, rights->group_count, rights->groups))
+	if (take_groups(rights, &own))
 		return -1;
 	set_effective_user(rights->user, rights->group);
 	if (!is_effective_user(rights->user, rights->group))
@@ -116,6 +126,6 @@ int file_rights_pair(const struct file_rights *rights, int type, int ends[2])
 	/* The real user is still our own, and our capabilities come back with it. */
 	syscall(SYS_setresuid, -1, own.user, -1);
 	syscall(SYS_setresgid, -1, own.group, -1);
-	(void)syscall(SYS_setgroups, own.group_count, own.groups);
+	give_groups_back(&own);
 	return result;
 }

@@ -229,9 +229,14 @@ def _used_bytes(folder: Path, version: int) -> int | None:
     if not text.isdecimal():
         return None
     prefix = "" if version == 2 else "total_"
-    stat = dict(line.split(" ", 1) for line in _read(folder / "memory.stat").splitlines() if " " in line)
+    stat = fields_of(folder / "memory.stat")
     cache = sum(int(stat.get(prefix + key, 0)) for key in ("inactive_file", "active_file"))
     return max(int(text) - cache, 0)
+
+
+def fields_of(path: Path) -> dict[str, str]:
+    """Of a file with a name and a value in each line; empty when it cannot be read."""
+    return dict(line.split(" ", 1) for line in _read(path).splitlines() if " " in line)
 
 
 def _lines(path: Path) -> list[str]:

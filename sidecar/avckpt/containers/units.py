@@ -16,15 +16,15 @@ import os
 import re
 import socket
 import struct
-import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from avckpt_hooks.shared.labels import LABELS, SHM_MAX_BYTES, LabelError, parse_policy
 from avckpt_hooks.shared.protocol import ProtocolError, received_fds
 
+from avckpt.bucket import Bucket
 from avckpt.containers.process import has_ended, is_foreign, pid_of, start_time, status
 from avckpt.errors import AvckptError, Busy, Denied, LabelsWrong, TargetGone, of_any
 
@@ -225,26 +225,11 @@ def _is_below(path: str, top: str) -> bool:
 
 
 @dataclass
-class Allowance:
-    """How many registrations one container has left.  Times are CLOCK_MONOTONIC seconds."""
+class Allowance(Bucket):
+    """How many registrations one container has left."""
 
     most: float = UNITS_MOST
     per_s: float = REGISTRATIONS_PER_S
-    left: float = field(init=False)
-    at_s: float = field(default_factory=time.monotonic)
-
-    def __post_init__(self) -> None:
-        self.left = self.most
-
-    def has_one(self) -> bool:
-        """Whether there was one, which is taken."""
-        now = time.monotonic()
-        self.left = min(self.left + (now - self.at_s) * self.per_s, self.most)
-        self.at_s = now
-        if self.left < 1:
-            return False
-        self.left -= 1
-        return True
 
     def take(self) -> None:
         """Raises Busy when there are none."""
@@ -280,9 +265,9 @@ class UnitListener:
         self._loop = asyncio.get_running_loop()
         self._waiting: dict[socket.socket, tuple[asyncio.TimerHandle, int]] = {}
         """And of which PID namespace."""
-        self._peers: OrderedDict[tuple[int, int], Allowance] = OrderedDict()
+        self._peers: OrderedDict[tuple[int, int], Bucket] = OrderedDict()
         """By PID namespace and user."""
-        self._refusals = Allowance(REFUSALS_TOLD, 1 / REFUSAL_S)
+        self._refusals = Bucket(REFUSALS_TOLD, 1 / REFUSAL_S)
         self._untold = 0
         self._socket = listen(path)
         self._loop.add_reader(self._socket, self._accept)
@@ -322,7 +307,7 @@ class UnitListener:
         self._loop.add_reader(connection, self._serve, connection)
 
     def _may_ask(self, space: int, uid: int) -> bool:
-        peer = self._peers.setdefault((space, uid), Allowance(CONNECTIONS_MOST, CONNECTIONS_PER_S))
+        peer = self._peers.setdefault((space, uid), Bucket(CONNECTIONS_MOST, CONNECTIONS_PER_S))
         self._peers.move_to_end((space, uid))
         if len(self._peers) > PEERS_MOST:
             self._peers.popitem(last=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 
+from avckpt.bucket import Bucket
 from avckpt.events.record import EventRecord
 from avckpt.events.vocabulary import EXPECTED, Kind, Reason
 
@@ -62,17 +63,13 @@ class _Often:
     """Lets so many lines through at once, and then one per `OFTEN_S`; the others are counted."""
 
     def __init__(self) -> None:
-        self._left = float(OFTEN_AT_ONCE)
-        self._at_s = 0.0
+        self._bucket = Bucket(OFTEN_AT_ONCE, 1 / OFTEN_S, at_s=0.0)
         self._untold = 0
 
     def line(self, at_s: float, line: tuple[int, str]) -> tuple[int, str] | None:
-        self._left = min(self._left + (at_s - self._at_s) / OFTEN_S, OFTEN_AT_ONCE)
-        self._at_s = at_s
-        if self._left < 1:
+        if not self._bucket.has_one(at_s):
             self._untold += 1
             return None
-        self._left -= 1
         more = f" (and {self._untold} more lines of that kind before)" if self._untold else ""
         self._untold = 0
         return line[0], line[1] + more

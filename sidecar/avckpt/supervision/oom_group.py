@@ -17,7 +17,7 @@ import signal
 from dataclasses import dataclass
 from pathlib import Path
 
-from avckpt.containers.cgroup import Groups
+from avckpt.containers.cgroup import Groups, fields_of
 from avckpt.containers.process import open_app
 from avckpt.containers.protected import Protected
 from avckpt.errors import TargetGone
@@ -78,12 +78,7 @@ class OomGroup:
                 self._file.write_text("0")
 
     def _count(self) -> int:
-        with contextlib.suppress(OSError, ValueError):
-            for line in (self.folder / "memory.events").read_text().splitlines():
-                name, _, number = line.partition(" ")
-                if name == "oom_kill":
-                    return int(number)
-        return self.kills
+        return int(fields_of(self.folder / "memory.events").get("oom_kill", self.kills))
 
 
 def oom_group_of(groups: Groups, container: Protected, init_pidfd: int) -> OomGroup | None:
