@@ -234,7 +234,6 @@ struct file_socket {
 	struct file_node *node; /* files_unix.c, allocated, NULL: none or not known */
 	uint64_t peer;          /* inode of the other end of a Unix socket, 0: not known    */
 	bool asked;             /* for that                                               */
-	uint64_t partner;       /* the same of one that was connected by a name             */
 	socklen_t local_bytes, remote_bytes;
 	struct sockaddr_storage local, remote;
 };
@@ -447,8 +446,7 @@ void file_look_at_socket(int fd, struct file *file);
 int file_option(int fd, int level, int name);
 void file_look_at_tcp(int fd, struct file *file, const struct file_socket *socket);
 void files_find_peers(struct files *files, pid_t pid);
-/* The same of Unix sockets that were connected by a name. */
-void files_find_partners(struct files *files, pid_t pid);
+/* Whether it, or what it is connected to, was bound. */
 bool file_has_name(const struct file_socket *socket);
 /* Whether both ends of this pipe or socket pair are in the table. */
 const struct file *files_other_end(struct files *files, const struct file *file);

@@ -110,7 +110,7 @@ static bool may_go_on(const struct file *f)
 	if (!s || f->outside || !s->connected || f->flags & O_PATH)
 		return false;
 	if (s->domain == AF_UNIX)
-		return (s->type == SOCK_STREAM || s->type == SOCK_SEQPACKET) && s->partner;
+		return (s->type == SOCK_STREAM || s->type == SOCK_SEQPACKET) && s->peer;
 	return s->protocol == IPPROTO_TCP && s->type == SOCK_STREAM;
 }
 
@@ -173,8 +173,7 @@ static bool name_tcp(int fd, struct group_end *end)
 static void name_unix(const struct file *f, struct group_end *end)
 {
 	end->own = (struct avc_end_name){ .where = f->ino, .protocol = PROTOCOL_UNIX };
-	end->other = (struct avc_end_name){ .where = f->socket->partner,
-					    .protocol = PROTOCOL_UNIX };
+	end->other = (struct avc_end_name){ .where = f->socket->peer, .protocol = PROTOCOL_UNIX };
 }
 
 static const char uncounted[] = "its bytes could not be counted";
@@ -308,7 +307,7 @@ struct group_ends *files_ends_new(const struct image *image, uint32_t images,
 
 		if (!files || !image[i].process)
 			continue;
-		files_find_partners(files, image[i].process->pid);
+		files_find_peers(files, image[i].process->pid);
 		for (uint32_t k = 0; k < files->count; k++)
 			any |= may_go_on(&files->file[k]);
 		if (any && !ends)

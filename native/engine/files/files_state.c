@@ -225,7 +225,7 @@ static void hear_diag(const struct nlmsghdr *head, struct file_socket *s)
 			break;
 		if (attribute->nla_type == UNIX_DIAG_PEER) {
 			memcpy(&peer, attribute + 1, sizeof peer);
-			*(file_has_name(s) ? &s->partner : &s->peer) = peer;
+			s->peer = peer;
 		}
 		if (attribute->nla_type == UNIX_DIAG_SHUTDOWN)
 			memcpy(&s->shut, attribute + 1, sizeof s->shut);
@@ -253,19 +253,12 @@ static int diag_open(pid_t pid)
 	return fd;
 }
 
-/* Only unnamed ones at both ends come from socketpair(2). */
+/* Comes from socketpair(2), or from connect(2) and accept(2).  A datagram socket with a name, or
+ * connected by one, may have many others. */
 static bool maybe_pair(const struct file *f)
 {
 	return f->kind == FILE_SOCKET && f->socket && f->socket->domain == AF_UNIX &&
-	       f->socket->connected && !file_has_name(f->socket);
-}
-
-/* Connected by a name.  There is no other end before it is accepted. */
-static bool wants_partner(const struct file *f)
-{
-	return f->kind == FILE_SOCKET && f->socket && f->socket->domain == AF_UNIX &&
-	       f->socket->type != SOCK_DGRAM && f->socket->connected && file_has_name(f->socket) &&
-	       !f->socket->partner;
+	       f->socket->connected && (f->socket->type != SOCK_DGRAM || !file_has_name(f->socket));
 }
 
 static int by_inode(const void *a, const void *b)
@@ -307,17 +300,32 @@ static void hear_all(int diag, struct file **asked, uint32_t count, bool one)
 	}
 }
 
+/* Once; but a connection has no other end before it is accepted. */
+static bool wants_peer(const struct file *f)
+{
+	struct file_socket *s = f->kind == FILE_SOCKET ? f->socket : NULL;
+	const bool pair = maybe_pair(f);
+
+	if (!s || !(pair || s->backlog < 0) ||
+	    (s->asked && !(pair && file_has_name(s) && !s->peer && !s->shut)))
+		return false;
+	s->asked = true;
+	if (s->listening)
+		s->backlog = SOMAXCONN;
+	return true;
+}
+
 /* The kernel takes as long to find one socket as to list all (net/unix/diag.c). */
 #define ASKED_EACH 4
 
-static void find_ends(struct files *files, pid_t pid, bool (*wants)(const struct file *))
+void files_find_peers(struct files *files, pid_t pid)
 {
 	struct file **asked = calloc(files->count + 1, sizeof *asked);
 	uint32_t count = 0;
 	int diag;
 
 	for (uint32_t i = 0; asked && i < files->count; i++)
-		if (wants(&files->file[i]))
+		if (wants_peer(&files->file[i]))
 			asked[count++] = &files->file[i];
 	diag = count ? diag_open(pid) : -1;
 	if (diag >= 0) {
@@ -330,28 +338,6 @@ static void find_ends(struct files *files, pid_t pid, bool (*wants)(const struct
 	}
 	close_fd(&diag);
 	free(asked);
-}
-
-static bool wants_peer(const struct file *f)
-{
-	struct file_socket *s = f->kind == FILE_SOCKET ? f->socket : NULL;
-
-	if (!s || s->asked || !(maybe_pair(f) || s->backlog < 0))
-		return false;
-	s->asked = true;
-	if (s->listening)
-		s->backlog = SOMAXCONN;
-	return true;
-}
-
-void files_find_peers(struct files *files, pid_t pid)
-{
-	find_ends(files, pid, wants_peer);
-}
-
-void files_find_partners(struct files *files, pid_t pid)
-{
-	find_ends(files, pid, wants_partner);
 }
 
 /* ---- bytes in pipes and socket pairs ------------------------------------------ */
