@@ -65,11 +65,12 @@ def test_goes_back_again_and_again_beside_output(tmp_path: Path) -> None:
         *((how, IN_PLACE) for how in ("in-place", "at-end", "extend", "close", "locked", "mapped", "worker")),
         ("temporary", DELETED),
         ("scratch", DELETED),
+        ("named", DELETED),
     ],
 )
-def test_starts_cold_behind_a_database(how: str, why: str, tmp_path: Path) -> None:
+def test_starts_cold_behind_a_database(how: str, why: str, memory: Path, tmp_path: Path) -> None:
     with (
-        Victim(f"ledger {how} {tmp_path}", tmp_path) as victim,
+        Victim(f"ledger {how} {memory if how == 'named' else tmp_path}", tmp_path) as victim,
         GuardProcess(config(files=Files.AUTO), [victim.pid]) as guard,
     ):
         time.sleep(0.05)
@@ -91,6 +92,19 @@ def test_starts_cold_behind_a_database(how: str, why: str, tmp_path: Path) -> No
         assert "avckpt.files=auto" in str(gave_up["error"])
         assert why in str(gave_up["error"])
         assert victim.end() == 128 + signal.SIGKILL
+
+
+def test_goes_back_to_shared_memory_that_had_no_name_any_more(memory: Path, tmp_path: Path) -> None:
+    with (
+        Victim(f"ledger named {memory}", tmp_path) as victim,
+        GuardProcess(config(files=Files.AUTO), [victim.pid]) as guard,
+    ):
+        checkpoint(guard)
+        write(victim)
+        checkpoint(guard)
+        victim.kill_app()
+        guard.wait("restored")
+        victim.wait_beats()
 
 
 def test_goes_back_behind_a_database_if_it_is_told_to(tmp_path: Path) -> None:

@@ -133,16 +133,28 @@ static void write_mapping(void)
 	mapping[5000]++;
 }
 
+/* As sem_open(3) does: nothing is open any more. */
+static void map_named(void)
+{
+	map(SMALL);
+	close(fd);
+}
+
+static void unlink_it(void)
+{
+	must(unlink(path_of("data")) == 0, "unlink");
+}
+
 static void delete (void)
 {
 	close(fd);
-	must(unlink(path_of("data")) == 0, "unlink");
+	unlink_it();
 }
 
 static void scratch(void)
 {
 	database();
-	must(unlink(path_of("data")) == 0, "unlink");
+	unlink_it();
 }
 
 static void close_it(void)
@@ -215,6 +227,7 @@ static const struct way {
 	{ "temporary", output, delete },
 	{ "scratch", scratch, close_it },
 	{ "worker", worker, ask_worker },
+	{ "named", map_named, unlink_it },
 };
 
 int main(int argc, char **argv)

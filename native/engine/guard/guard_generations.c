@@ -541,6 +541,9 @@ int guard_check_files(struct avc_guard *guard, const struct generation *generati
 		return fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
 			    "avckpt.files=%s: %.80s was written since the checkpoint",
 			    strict ? "strict" : "auto", generation->written);
+	for (uint32_t i = 0; i < generation->images; i++)
+		if (memory_check_names(&generation->image[i], strict ? "strict" : "auto", err))
+			return -1;
 	if (!strict)
 		return check_auto(guard, generation, pidfd, err);
 	for (uint32_t i = 0; i < generation->images; i++) {

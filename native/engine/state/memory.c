@@ -203,12 +203,15 @@ int memory_prepare(const struct process *process, struct mem_image **image, stru
 	return 0;
 }
 
-static bool is_area(int path_fd, const struct area *a)
+static bool is_area(int path_fd, struct area *a)
 {
 	struct statx st;
 
-	return fd_look(path_fd, STATX_INO, &st) && st.stx_ino == a->inode &&
-	       device_of(&st) == a->device;
+	if (!fd_look(path_fd, STATX_INO | STATX_NLINK, &st) || st.stx_ino != a->inode ||
+	    device_of(&st) != a->device)
+		return false;
+	a->linked = a->as_file && st.stx_nlink;
+	return true;
 }
 
 /* Reads through the mapped file, if it still is the one that was found to be memory.  No single
@@ -606,6 +609,28 @@ static int put_back(const struct putting *putting, struct area *a, const uint8_t
 			a->writes = mem_others_writes(others, a);
 	}
 	return put ? 0 : note_unless_equal(a, putting->mem_fd, from, putting->notes);
+}
+
+int memory_check_names(const struct image *image, const char *files, struct avc_error *err)
+{
+	const struct mem_image *memory = image->memory;
+
+	for (uint32_t i = 0; memory && i < memory->areas.count; i++) {
+		const struct area *a = &memory->areas.area[i];
+		char link[48], name[256];
+		struct statx st;
+
+		(void)budget_step();
+		snprintf(link, sizeof link, "map_files/%lx-%lx", (unsigned long)a->start,
+			 (unsigned long)a->end);
+		if (a->linked && proc_look(image->template, link, STATX_NLINK, &st) &&
+		    !st.stx_nlink && !proc_link(image->template, link, name, sizeof name))
+			return fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
+				    "avckpt.files=%s: the shared memory %.60s was deleted since "
+				    "the checkpoint",
+				    files, name);
+	}
+	return 0;
 }
 
 int memory_put_back(const struct image *image, pid_t pid, struct avc_error *notes,

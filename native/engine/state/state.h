@@ -285,6 +285,11 @@ int memory_check_unkept(const struct image *image, uint32_t images,
 			struct avc_error *err) warn_unused;
 /* When all of a checkpoint are finished: fails if that is more than may be kept. */
 void memory_note_left(const struct image *image, uint32_t images, struct avc_error *notice);
+/* Before a restore: fails if memory that only the application has, such as that of sem_open(3), has
+ * lost its name since.  A process that went back would look for it by that name, and wait for what
+ * will never come.  `files`: the label's value that asks for this. */
+int memory_check_names(const struct image *image, const char *files,
+		       struct avc_error *err) warn_unused;
 /* At a restore, before anything runs; *notes: what could not be written. */
 int memory_put_back(const struct image *image, pid_t pid, struct avc_error *notes,
 		    struct avc_error *err) warn_unused;
