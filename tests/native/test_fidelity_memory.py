@@ -325,3 +325,22 @@ def test_node(tmp_path: Path) -> None:
     with Victim(command, tmp_path) as victim, GuardProcess(config(0.1), [victim.pid]) as guard:
         assert flagged(victim.player, "dc")
         kill_at_random(guard, victim, 30, (0.05, 0.4))
+
+
+def go_on(victim: Victim) -> None:
+    """Waits until its child has looked at its memory again."""
+    looks = victim.see().counter[0]
+    wait_until(lambda: victim.see().counter[0] > looks + 5, 20, "the child goes on")
+
+
+def test_a_child_has_memory_where_its_parent_has_its_vdso(tmp_path: Path) -> None:
+    """It has executed another program; the kernel looks for room where the process that forked it does."""
+    with Victim("shadow", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        for _ in range(3):
+            assert guard.checkpoint()["kind"] == "checkpoint"
+            since = guard.mark()
+            victim.kill_app()
+            event = guard.wait("restored", since=since)
+            assert "error" not in event, event
+            go_on(victim)
+            assert not victim.see().violations, victim.said

@@ -35,10 +35,11 @@ static bool same_backing(const struct mapping *a, const struct mapping *b)
 		(a->offset - a->start == b->offset - b->start && !strcmp(a->name, b->name)));
 }
 
-/* What stays in any case; the range of our parasite is not touched. */
-static bool is_fixed(const struct remap *r, const struct mapping *m, avc_remote address)
+/* The range of our parasite is not touched, and what the kernel maps is moved there by itself. */
+static bool is_fixed(const struct remap *r, const struct mapping *wanted, avc_remote address)
 {
-	return mapping_is_special(m) || parasite_contains(&r->process->parasite, address);
+	return (wanted && mapping_is_special(wanted)) ||
+	       parasite_contains(&r->process->parasite, address);
 }
 
 static const struct mapping *at(const struct mappings *maps, uint32_t *next, avc_remote address)
@@ -74,7 +75,10 @@ static int cut(struct remap *r, struct avc_error *err)
 
 		if (end == UINT64_MAX)
 			return 0;
-		if ((a && is_fixed(r, a, address)) || (b && is_fixed(r, b, address)))
+		/* The parent's vDSO has been moved away when anything is mapped in its place. */
+		if (a && mapping_is_special(a))
+			a = NULL;
+		if (is_fixed(r, b, address))
 			a = b = NULL;
 		if (a || b)
 			r->piece[r->pieces++] = (struct piece){
