@@ -8,6 +8,8 @@ import os
 import random
 import shutil
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -50,6 +52,7 @@ def pages(mappings: list[str]) -> set[int]:
         *("mappings", "mappings 0", "mappings 3000", "mappings 64 --future"),
         *("mappings --unbound --in-child", "mappings 3000 --unbound --in-child"),
         "mappings 64 --future --unbound --in-child",
+        *("mappings --segment", "mappings 3000 --segment --unbound --in-child"),
     ],
 )
 def test_every_kind_of_memory(command: str, tmp_path: Path) -> None:
@@ -256,6 +259,43 @@ def test_what_others_have_open_for_writing_is_theirs_and_told(visible: Path, tmp
         GuardProcess(config(), [victim.pid]) as guard,
     ):
         assert "shared memory are also others'" in guard.checkpoint()["error"]["message"]
+
+
+ATTACH = """
+import ctypes, os, sys
+libc = ctypes.CDLL(None, use_errno=True)
+libc.shmget.argtypes = [ctypes.c_int, ctypes.c_size_t, ctypes.c_int]
+libc.shmat.argtypes, libc.shmat.restype = [ctypes.c_int, ctypes.c_void_p, ctypes.c_int], ctypes.c_void_p
+number = int(sys.argv[1])
+if sys.argv[2:]:  # another segment, with the same number
+    assert libc.unshare(0x08000000) == 0
+    open("/proc/sys/kernel/shm_next_id", "w").write(str(number))
+    assert libc.shmget(0, 4096, 0o600) == number
+attached = libc.shmat(number, None, 0)
+print("no" if attached == ctypes.c_void_p(-1).value else "yes", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_a_segment_that_others_have_attached_is_theirs_and_told(elsewhere: bool, tmp_path: Path) -> None:
+    """Not so one of another container, which may have the same number."""
+    with Victim("mappings --segment", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        maps = Path(f"/proc/{victim.app}/maps").read_text().splitlines()
+        number = next(int(line.split()[4]) for line in maps if "/SYSV" in line)
+        command = [sys.executable, "-c", ATTACH, str(number), *(["elsewhere"] if elsewhere else [])]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+            assert other.stdout
+            assert other.stdout.readline() == "yes\n"
+            told = guard.checkpoint().get("error", {}).get("message", "")
+            assert ("shared memory are also others'" in told) != elsewhere
+            if elsewhere:
+                since = guard.mark()
+                victim.kill_app()
+                guard.wait("restored", since=since)
+                victim.wait_beats()
+            assert other.stdin
+            other.stdin.close()
 
 
 @pytest.mark.usefixtures("huge_pages")

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * mappings [SHARED_KB] [--inherited] [--huge] [--future] [--large] [--unbound]: memory of
+ * mappings [SHARED_KB] [--inherited] [--huge] [--segment] [--future] [--large] [--unbound]: memory of
  * every kind a plain fork does not carry as it is, and kinds that are easily forgotten.  Each
  * is written and read all the time.
  *
@@ -17,7 +17,7 @@
  * - mappings that come and go all the time
  *
  * With --inherited the first two are ordinary memory; with --huge the shared memory is of
- * huge pages; with --large there are 64 MB more of shared memory, of which nothing is
+ * huge pages, with --segment System V's; with --large there are 64 MB more of shared memory, of which nothing is
  * expected; with --future all memory that comes is locked (mlockall); with --unbound no area
  * has a policy.
  */
@@ -25,6 +25,7 @@
 #include <setjmp.h>
 #include <signal.h>
 #include <sys/resource.h>
+#include <sys/shm.h>
 
 #include "victim.h"
 
@@ -49,6 +50,16 @@ static void *map(int protection, int flags, int fd)
 	void *at = mmap(NULL, BYTES, protection, flags, fd, 0);
 
 	must(at != MAP_FAILED, "mmap");
+	return at;
+}
+
+/* As PostgreSQL has some: others can attach it. */
+static void *attach(size_t bytes)
+{
+	const int id = shmget(IPC_PRIVATE, bytes, 0600);
+	void *at = id < 0 ? (void *)-1 : shmat(id, NULL, 0);
+
+	must(at != (void *)-1 && !shmctl(id, IPC_RMID, NULL), "shmat");
 	return at;
 }
 
@@ -167,16 +178,18 @@ int main(int argc, char **argv)
 	size_t shared_kb, lap;
 	uint64_t *read_only, *none, *heap;
 	char *brk_at;
-	bool inherited, huge, large, unbound;
+	bool inherited, huge, segment, large, unbound;
 	int n = 0, fd;
 
 	inherited = victim_flag(&argc, argv, "--inherited");
 	huge = victim_flag(&argc, argv, "--huge");
+	segment = victim_flag(&argc, argv, "--segment");
 	future = victim_flag(&argc, argv, "--future");
 	large = victim_flag(&argc, argv, "--large");
 	unbound = victim_flag(&argc, argv, "--unbound");
-	victim_start(&argc, argv, 0,
-		     "[SHARED_KB] [--inherited] [--huge] [--future] [--large] [--unbound]");
+	victim_start(
+		&argc, argv, 0,
+		"[SHARED_KB] [--inherited] [--huge] [--segment] [--future] [--large] [--unbound]");
 	shared_kb = argc > 1 ? (size_t)atol(argv[1]) : 64;
 	sigaction(SIGSEGV, &act, NULL);
 
@@ -204,8 +217,10 @@ int main(int argc, char **argv)
 	must(heap != (void *)-1, "sbrk");
 	regions[n++] = (struct region){ "the heap", heap, BYTES / 8 };
 	if (shared_kb) {
-		void *at = mmap(NULL, shared_kb << 10, PROT_READ | PROT_WRITE,
-				MAP_SHARED | MAP_ANONYMOUS | (huge ? MAP_HUGETLB : 0), -1, 0);
+		void *at = segment ? attach(shared_kb << 10)
+				   : mmap(NULL, shared_kb << 10, PROT_READ | PROT_WRITE,
+					  MAP_SHARED | MAP_ANONYMOUS | (huge ? MAP_HUGETLB : 0), -1,
+					  0);
 
 		must(at != MAP_FAILED, "mmap");
 		regions[n++] = (struct region){ "shared memory", at, (shared_kb << 10) / 8 };

@@ -208,7 +208,7 @@ static bool is_area(int path_fd, struct area *a)
 	struct statx st;
 
 	if (!fd_look(path_fd, STATX_INO | STATX_NLINK, &st) || st.stx_ino != a->inode ||
-	    device_of(&st) != a->device)
+	    device_of(&st) != area_device(a))
 		return false;
 	a->linked = a->as_file && st.stx_nlink;
 	return true;
@@ -219,7 +219,7 @@ static bool is_area(int path_fd, struct area *a)
  * never written. */
 static bool copy_area(pid_t pid, struct area *a, uint8_t *to, struct mem_image *image)
 {
-	const struct mapping m = { .device = a->device, .inode = a->inode };
+	const struct mapping m = { .device = area_device(a), .inode = a->inode };
 	int path_fd = proc_open_mapped(pid, a->start, a->end, O_PATH), fd = -1;
 	ssize_t n = -1;
 

@@ -22,7 +22,8 @@ enum area_way {
 
 struct area {
 	avc_remote start, end;
-	uint64_t offset, inode, device;
+	uint64_t offset, inode;
+	uint64_t device;    /* of System V memory with more: segment_device()          */
 	bool wiped;         /* MADV_WIPEONFORK; else shared memory                     */
 	bool named;         /* other processes can have it as well */
 	bool as_file;       /* ... or open by that name                                */
@@ -34,6 +35,16 @@ struct area {
 	uint32_t writes; /* memory_others.c: as of the checkpoint                   */
 	size_t kept;     /* bytes that are in the image: less where the file ends earlier */
 };
+
+/* System V memory: a segment's inode is its number, which is its own in its IPC namespace only. */
+bool mapping_is_segment(const struct mapping *mapping);
+/* A device, and the IPC namespace of a process above it, which tells such segments apart, also from
+ * other memory; and the device alone. */
+uint64_t segment_device(uint64_t device, pid_t pid);
+static inline uint64_t area_device(const struct area *a)
+{
+	return a->device & UINT32_MAX;
+}
 
 struct areas {
 	uint32_t count, room;

@@ -89,6 +89,18 @@ static bool has_name(const struct mapping *m)
 	return m->shared && m->inode && name && strncmp(name, "avckpt-kept", 11) != 0;
 }
 
+bool mapping_is_segment(const struct mapping *m)
+{
+	return m->shared && device_is_memory(m->device) && !strncmp(m->name, "/SYSV", 5);
+}
+
+uint64_t segment_device(uint64_t device, pid_t pid)
+{
+	struct statx st;
+
+	return proc_look(pid, "ns/ipc", STATX_INO, &st) ? device | st.stx_ino << 32 : device;
+}
+
 /* A file on a disk may have such a name. */
 static bool is_memory(struct survey *survey, const struct mapping *m)
 {
@@ -193,7 +205,7 @@ static int find_area(const struct mapping *m, void *arg)
 	 * should be: no random data is repeated. */
 	const bool wiped = (m->flags & (MAPPING_WIPEONFORK | MAPPING_DROPPABLE)) ==
 			   MAPPING_WIPEONFORK;
-	bool named;
+	bool segment, named;
 
 	hash_mapping(m, arg);
 	survey->unforked |= survey->recycled && m->flags & MAPPING_DONTFORK &&
@@ -207,7 +219,8 @@ static int find_area(const struct mapping *m, void *arg)
 			marks_add(&survey->memory->advised, m, advice_of(m));
 	}
 	survey->private_huge |= m->flags & MAPPING_HUGETLB && !m->shared;
-	named = !wiped && has_name(m) && is_memory(survey, m);
+	segment = !wiped && mapping_is_segment(m);
+	named = segment || (!wiped && has_name(m) && is_memory(survey, m));
 	if ((!wiped && !is_shared(m) && !named) || is_of_parasite(survey->process, m->start))
 		return 0;
 	if (survey->areas.count == AREAS_MAX) {
@@ -219,11 +232,11 @@ static int find_area(const struct mapping *m, void *arg)
 		.end = m->end,
 		.offset = m->offset,
 		.inode = m->inode,
-		.device = m->device,
+		.device = segment ? segment_device(m->device, survey->process->pid) : m->device,
 		.wiped = wiped,
 		.named = named,
 		/* Any process that sees the file system can open it. */
-		.as_file = named && !device_is_memory(m->device),
+		.as_file = named && !segment && !device_is_memory(m->device),
 		.protection = (uint8_t)mapping_protection(m),
 		.way = m->mode[1] == 'w' ? WAY_MAPPING : WAY_NONE,
 	};

@@ -103,10 +103,19 @@ static void add_object(struct mem_others *others, uint64_t device, uint64_t inod
 	others->object[others->count++] = (struct object){ device, inode };
 }
 
+struct looking {
+	struct mem_others *others;
+	pid_t pid;
+};
+
 static int add_mapped(const struct mapping *m, void *arg)
 {
-	if (m->shared && m->inode)
-		add_object(arg, m->device, m->inode);
+	const struct looking *at = arg;
+
+	if (mapping_is_segment(m))
+		add_object(at->others, segment_device(m->device, at->pid), m->inode);
+	else if (m->shared && m->inode)
+		add_object(at->others, m->device, m->inode);
 	return 0;
 }
 
@@ -186,7 +195,7 @@ static void look(struct mem_others *others, const struct process *process)
 		    (!strcmp(its, inside) && (whole || is_below(pid, process->init))))
 			continue;
 		heartbeat();
-		(void)proc_mappings(pid, "maps", add_mapped, others);
+		(void)proc_mappings(pid, "maps", add_mapped, &(struct looking){ others, pid });
 		add_opened(others, pid);
 	}
 	if (proc)
