@@ -7,6 +7,7 @@ but not yet its merge keys. This module adds what is needed for messages.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -142,6 +143,23 @@ def entries(node: yaml.Node | None) -> list[tuple[yaml.ScalarNode, yaml.Node]]:
             own.append((key, value))
     hidden = {key.value for key, _ in own}
     return [entry for name, entry in merged.items() if name not in hidden] + own
+
+
+def repeated(node: yaml.Node | None, seen: set[int] | None = None) -> Iterator[yaml.ScalarNode]:
+    """Keys in `node`, or anything below it, that their mapping has had before: programs take the last one, or
+    refuse."""
+    seen = set() if seen is None else seen
+    if node is None or id(node) in seen or isinstance(node, yaml.ScalarNode):
+        return
+    seen.add(id(node))  # aliases
+    had = set()
+    for part in node.value:
+        for each in part if isinstance(node, yaml.MappingNode) else (part,):
+            yield from repeated(each, seen)
+        if isinstance(node, yaml.MappingNode) and isinstance(part[0], yaml.ScalarNode):
+            if part[0].value in had:
+                yield part[0]
+            had.add(part[0].value)
 
 
 def lookup(node: yaml.Node | None, key: str) -> yaml.Node | None:

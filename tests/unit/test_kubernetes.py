@@ -89,3 +89,16 @@ def test_containers_of_a_pod_are_a_group(tmp_path: Path) -> None:
     path = tmp_path / "pod.yaml"
     path.write_text(yaml.safe_dump(pod))
     assert pods.check([path]).problems == []
+
+
+def test_what_is_written_as_in_compose_is_no_annotation(tmp_path: Path) -> None:
+    path = tmp_path / "pod.yaml"
+    path.write_text(
+        "apiVersion: v1\nkind: Pod\nmetadata:\n  name: car\n  annotations:\n  - avckpt.enable=true\n"
+        "spec:\n  containers: []\n  containers: [{name: node, image: node}]\n"
+    )
+    none, twice = pods.check([path]).problems
+    assert str(none).startswith(f"{path}:6: service Pod/car: annotations and labels are a mapping")
+    assert str(twice).startswith(f"{path}:9: warning: containers is given twice")
+    path.write_text("apiVersion: v1\nkind: Pod\nmetadata:\n  name: car\n  annotations: ~\n")
+    assert pods.check([path]).problems == []

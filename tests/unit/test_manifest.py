@@ -382,3 +382,30 @@ def test_values_that_do_not_go_together(path: Path) -> None:
     assert lines(checked(path, text))[0].startswith(
         "v.yaml:6: service a: label avckpt.keep=1: too few for avckpt.restore.on=unhealthy"
     )
+
+
+def test_what_is_given_twice_is_lost(path: Path) -> None:
+    """Not what is merged, or reached by several aliases."""
+    found = checked(
+        path,
+        """\
+x-protect: &protect
+  avckpt.enable: true
+services:
+  camera:
+    labels: *protect
+    image: camera
+    labels:
+      <<: *protect
+      avckpt.enable: false
+      avckpt.keep: 3
+      avckpt.keep: 4
+  filter:
+    labels: *protect
+""",
+    )
+    told = [str(problem) for problem in found.problems if "twice" in problem.message]
+    assert told == [
+        f"{path}:{line}: warning: {key} is given twice: what was given first is lost"
+        for line, key in ((7, "labels"), (11, "avckpt.keep"))
+    ]

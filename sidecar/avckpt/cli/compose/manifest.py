@@ -397,10 +397,18 @@ class _Reader:
                     self._complain(asked_at, f"{path}: {error.why}", service)
                 else:
                     self._complain(error.place, error.why)
+            self._manifest.problems += repeated(self._roots[path], path)
         return self._roots[path]
 
     def _complain(self, place: Place, message: str, service: str = "") -> None:
         self._manifest.problems.append(Problem(place, service, message))
+
+
+def repeated(document: yaml.Node | None, path: Path) -> Iterator[Problem]:
+    """What is lost in a document because something is given again."""
+    for key in yamlfile.repeated(document):
+        message = f"{key.value} is given twice: what was given first is lost"
+        yield Problem(yamlfile.place_of(key, path), "", message, Severity.WARNING)
 
 
 def _extends(node: yaml.Node, path: Path) -> tuple[Path, str] | None:
