@@ -106,7 +106,9 @@ def test_the_command_of_one_that_left_nothing(sidecar: LocalSidecar) -> None:
     """The sidecar looks when the memory of the dead is not there any more."""
     program = ["sh", "-c", f"sleep 0.2; exec {sys.executable} -c '{VICTIM}'"]
     victim = sidecar.protected("victim", program, {**QUICK, "avckpt.keep": "1"})
-    sidecar.wait_for(victim, state="protected", threads=2)
+    so_far = sidecar.wait_for(victim, state="protected", threads=2)["checkpoints"]
+    # It has heard of the first one of the new program before, and looked.
+    wait_until(lambda: sidecar.row(victim)["checkpoints"] > so_far + 1, 10, "checkpoints", every_s=0.05)
     with asleep(sidecar):
         kill_unheard(victim, signal.SIGUSR1)
         left = set(children_of(victim.init_pid)) - {victim.app_pid}
