@@ -79,6 +79,8 @@ ssize_t read_whole(int fd, uint8_t *to, size_t bytes, off_t at);
 /* Room for one more element of `bytes` in *array, which has `count`; false: out of memory,
  * and nothing has changed. */
 bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes);
+/* Of `before` and these; for what nobody gains by a collision (else keyed_sum()). */
+uint64_t hash_bytes(uint64_t before, const void *data, size_t bytes);
 
 /* ---- keyed_sum.c ------------------------------------------------------------ */
 
@@ -385,6 +387,10 @@ struct mounts {
 	} * mount;
 };
 void mounts_free(struct mounts *mounts);
+#define SYS_LISTMOUNT 458 /* all CPUs, since Linux 6.8 */
+/* Changes when anything is mounted or unmounted for that process, or it has another mount namespace;
+ * 0: the kernel does not tell (before Linux 6.11). */
+uint64_t mounts_stamp(pid_t pid);
 /* The type of the one that a descriptor is on, without asking it; "": it is none of these. */
 const char *mount_type(struct mounts *mounts, pid_t pid, int fd);
 /* Whether any of these is served, or none is known. */

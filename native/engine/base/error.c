@@ -128,3 +128,12 @@ bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes)
 	*room = wanted;
 	return true;
 }
+
+uint64_t hash_bytes(uint64_t before, const void *data, size_t bytes)
+{
+	const uint8_t *p = data;
+
+	for (size_t i = 0; i < bytes; i++)
+		before = (before ^ p[i]) * UINT64_C(0x100000001b3); /* FNV-1a */
+	return before;
+}

@@ -10,12 +10,16 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/ioctl.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
 #include <unistd.h>
 
 #include "base.h"
+
+#define NS_GET_MNTNS_ID_ _IOR(0xb7, 5, uint64_t) /* linux/nsfs.h, since Linux 6.11 */
+#define MOUNTS_LISTED 256                        /* at a time                      */
 
 int open_below(int root, const char *path, uint64_t flags, uint64_t resolve)
 {
@@ -112,6 +116,30 @@ bool mounts_may_be_served(struct mounts *mounts, pid_t pid)
 		if (mount_is_served(mounts->mount[i].type))
 			return true;
 	return !mounts->count;
+}
+
+/* The mount namespace by its number, and in it the mounts by theirs: none is given twice while the
+ * machine runs.  Costs a tenth of mountinfo. */
+uint64_t mounts_stamp(pid_t pid)
+{
+	struct {
+		uint32_t size, spare;
+		uint64_t below, after, in;
+	} request = { .size = sizeof request, .below = UINT64_MAX /* LSMT_ROOT */ };
+	int fd = proc_open(pid, "ns/mnt", O_RDONLY);
+	const bool known = fd >= 0 && !ioctl(fd, NS_GET_MNTNS_ID_, &request.in);
+	uint64_t id[MOUNTS_LISTED], stamp = hash_bytes(1, &request.in, sizeof request.in);
+	long listed = known ? MOUNTS_LISTED : -1;
+
+	close_fd(&fd);
+	while (listed == MOUNTS_LISTED) {
+		listed = syscall(SYS_LISTMOUNT, &request, id, MOUNTS_LISTED, 0);
+		if (listed <= 0)
+			break;
+		stamp = hash_bytes(stamp, id, (size_t)listed * sizeof *id);
+		request.after = id[listed - 1];
+	}
+	return listed < 0 ? 0 : stamp;
 }
 
 void mounts_free(struct mounts *mounts)

@@ -184,6 +184,9 @@ struct layout_steps {
  * where mapped files differ; or out of memory. */
 bool layout_steps_find(char *is, char *want, struct layout_steps *steps);
 
+/* With avckpt.images=auto, a process with less anonymous memory is forked. */
+#define DIRTY_SMALL_PAGES 8192
+
 /* ---- dirty_tree.c -------------------------------------------------------------- */
 
 /* Before a freeze: decides about process.recycling, and copies what it can while the app runs.

@@ -32,7 +32,6 @@
 #define COPIES_SHARE 2
 #define OWN_SHARE 8 /* more than this part of the process: it is to share more with the others */
 #define OWN_LEAST 1024
-#define SMALL_PAGES 8192
 #define SLACK_PAGES 64 /* written until the freeze, by one process of many */
 #define FORK_NS 100000 /* without any pages */
 #define FORK_PAGE_NS 90
@@ -172,7 +171,7 @@ static bool is_small(const struct process *process)
 	long anonymous = 0;
 
 	return proc_vm_pages(process->statm_fd, &anonymous) >= 0 &&
-	       anonymous < (process->tracker ? SMALL_PAGES / 2 : SMALL_PAGES);
+	       anonymous < (process->tracker ? DIRTY_SMALL_PAGES / 2 : DIRTY_SMALL_PAGES);
 }
 
 /* Why its memory is not even to be watched. */

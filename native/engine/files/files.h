@@ -345,6 +345,7 @@ struct files {
 	uint32_t varied_count;
 	bool varied_known;
 	int64_t open;           /* at a restore: how many the table has; 0: unknown     */
+	uint64_t mounts;        /* mounts_stamp(), when that was found out: */
 	bool served;            /* some file system may be a file server's                 */
 	bool several;           /* other processes may have the other ends of pipes        */
 	bool with_tcp;          /* count the bytes of connections, during a freeze, too      */

@@ -187,6 +187,16 @@ static bool are_in_order(const struct files *files)
 	return true;
 }
 
+/* Most have the mounts that they had before, or that their parent has. */
+static bool may_be_served(struct look *look)
+{
+	const struct files *files = look->files, *seen = look->known ? look->known : files->parent;
+
+	if (seen && files->mounts && files->mounts == seen->mounts)
+		return seen->served;
+	return mounts_may_be_served(&look->mounts, look->pid);
+}
+
 int files_look(struct files *files, const struct files_owner *owner, enum files_depth depth,
 	       struct files *known, struct avc_error *err)
 {
@@ -218,6 +228,7 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 		look.init_stdio[i].ino = st.stx_ino;
 	}
 	files->count = 0;
+	files->mounts = depth == FILES_BEFORE ? mounts_stamp(pid) : 0;
 	clock_gettime(CLOCK_REALTIME, &now);
 	files->taken_ns = (uint64_t)now.tv_sec * NS_PER_S + (uint64_t)now.tv_nsec;
 	if (files->missing && !files->missing->count)
@@ -231,8 +242,7 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 	if (depth == FILES_NOW)
 		files->open = size_of_table(&look);
 	close(look.fd_dir);
-	files->served = depth == FILES_BEFORE ? mounts_may_be_served(&look.mounts, pid)
-					      : known && known->served;
+	files->served = depth == FILES_BEFORE ? may_be_served(&look) : known && known->served;
 	mounts_free(&look.mounts);
 	if (!result && depth == FILES_BEFORE && look.refuses)
 		result = fail(err, AVC_UNSUPPORTED, 0, pid, "look at descriptors", "", "%s",

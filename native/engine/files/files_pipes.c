@@ -88,21 +88,30 @@ static bool is_same(const struct end *a, const struct end *b)
 	return a->file->ino == b->file->ino && a->file->dev == b->file->dev;
 }
 
+static bool can_be_read(const struct file *f)
+{
+	return (f->flags & O_ACCMODE) != O_WRONLY;
+}
+
+/* Of one pipe, ends that can be read come first. */
 static int by_pipe(const void *a, const void *b)
 {
 	const struct file *x = ((const struct end *)a)->file, *y = ((const struct end *)b)->file;
 
-	return (x->ino > y->ino) - (x->ino < y->ino);
+	if (x->ino != y->ino)
+		return x->ino < y->ino ? -1 : 1;
+	return can_be_read(y) - can_be_read(x);
 }
 
-/* Each pipe once, by one of its ends. */
+/* Each pipe once, by one of its ends.  One that the app only writes to, such as a container's output,
+ * is neither read now nor made again. */
 static void ask_all(struct end *end, uint32_t count)
 {
 	struct inquiry *job = NULL;
 
 	qsort(end, count, sizeof *end, by_pipe);
 	for (uint32_t i = 0; i < count; i++) {
-		if (i && is_same(&end[i], &end[i - 1]))
+		if ((i && is_same(&end[i], &end[i - 1])) || !can_be_read(end[i].file))
 			continue;
 		if (!job)
 			job = inquiry_new();

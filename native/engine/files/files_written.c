@@ -129,13 +129,6 @@ static bool is_our_mount_namespace(pid_t pid)
 	       (ours.st_ino == theirs.st_ino && ours.st_dev == theirs.st_dev);
 }
 
-static uint64_t hash_line(uint64_t hash, const char *line)
-{
-	for (; *line; line++)
-		hash = (hash ^ (uint8_t)*line) * UINT64_C(0x100000001b3);
-	return hash;
-}
-
 void files_written_watch(struct files_written *written, pid_t pid, struct avc_error *notice)
 {
 	char *line = NULL, path[64];
@@ -150,7 +143,7 @@ void files_written_watch(struct files_written *written, pid_t pid, struct avc_er
 	if (!info)
 		return; /* it has ended */
 	while (getline(&line, &size, info) > 0)
-		mounts = hash_line(mounts, line);
+		mounts = hash_bytes(mounts, line, strlen(line));
 	/* New mounts are marked before the next checkpoint. */
 	if (mounts != written->mounts) {
 		rewind(info);

@@ -83,6 +83,7 @@ static const int plain[] = {
 	SYS_getxattr,
 	SYS_getdents64,
 	SYS_getcwd,
+	SYS_LISTMOUNT,
 	SYS_fchdir,
 	SYS_chroot,
 	SYS_umask,
@@ -227,6 +228,7 @@ static const struct rule rules[] = {
 	{ SYS_ioctl, 1, IS(PERF_EVENT_IOC_SET_FILTER) },
 	{ SYS_ioctl, 1, 'V' << 8, 0xff00 },  /* cameras */
 	{ SYS_ioctl, 1, 0xff << 8, 0xff00 }, /* namespaces of a pidfd */
+	{ SYS_ioctl, 1, IS(_IOR(0xb7, 5, uint64_t)) /* NS_GET_MNTNS_ID */ },
 
 	{ SYS_socket, 0, IS(AF_UNIX) },
 	{ SYS_socket, 0, IS(AF_INET) },

@@ -135,6 +135,9 @@ bool guard_has_room_for_copies(const struct avc_guard *guard)
 		return true;
 	for (uint32_t i = 0; i < newest->images; i++)
 		app += newest->image[i].anon_pages;
+	/* No process is copied, or little of it: saves a look at the machine's memory. */
+	if (app < DIRTY_SMALL_PAGES)
+		return true;
 	if (limit)
 		return app * (100 + COPIES) <= limit * FULL;
 	/* Those that exist are no longer available: the sidecar sees when memory becomes short. */

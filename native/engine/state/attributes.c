@@ -395,6 +395,10 @@ int attributes_keep(struct image *image, struct avc_error *err)
 	    !process->descendant) /* else it has its parent's */
 		return fail(err, AVC_GONE, ESRCH, process->pid, "keep template", "",
 			    "it has ended");
+	if (!image->oom_known && kept->oom_score_adj[0]) { /* it was cloned with that */
+		image->oom_own = image->oom_told = atoi(kept->oom_score_adj);
+		image->oom_known = true;
+	}
 	attributes_read_scheduling(image->template, &inherited);
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		const struct thread *t = &process->threads[i];

@@ -83,15 +83,6 @@ void inherited_answer(const struct parasite *parasite, uint32_t slot, struct inh
 	*dumpable = list->call[INHERITED_SIGNALS + INHERITED_VALUES].result;
 }
 
-static uint64_t hash(uint64_t h, const void *data, size_t bytes)
-{
-	const uint8_t *p = data;
-
-	for (size_t i = 0; i < bytes; i++)
-		h = (h ^ p[i]) * UINT64_C(0x100000001b3);
-	return h;
-}
-
 /* What prctl(2), PR_SET_MM, may change. */
 static int read_layout(struct inherited *inherited, pid_t pid)
 {
@@ -107,8 +98,8 @@ static int read_layout(struct inherited *inherited, pid_t pid)
 		p = strchr(p, ' ');
 		if ((field >= FIRST_LAYOUT_FIELD && field <= LAST_LAYOUT_FIELD) ||
 		    field >= SECOND_LAYOUT_FIELD)
-			inherited->stat = hash(inherited->stat, value,
-					       p ? (size_t)(p - value) : strlen(value));
+			inherited->stat = hash_bytes(inherited->stat, value,
+						     p ? (size_t)(p - value) : strlen(value));
 	}
 	return 0;
 }
@@ -131,7 +122,7 @@ static int read_places(struct inherited *inherited, pid_t pid)
 		what[0] = device_of(&st);
 		what[1] = st.stx_ino;
 		what[2] = st.stx_mnt_id;
-		inherited->places = hash(inherited->places, what, sizeof what);
+		inherited->places = hash_bytes(inherited->places, what, sizeof what);
 	}
 	return 0;
 }
