@@ -249,8 +249,9 @@ def _config(init_pidfd: int, config: GuardConfig) -> Any:
 
 
 def _event(e: Any) -> Event:
+    kind = Kind.of(e.kind)
     return Event(
-        kind=Kind.of(e.kind),
+        kind=kind,
         cookie=e.cookie,
         reason=Reason.of(e.reason) if e.reason else None,
         ticket=e.ticket,
@@ -275,7 +276,7 @@ def _event(e: Any) -> Event:
         stop_s=e.stop_ns / _NS_PER_S,
         clone_s=e.clone_ns / _NS_PER_S,
         wait_s=e.wait_ns / _NS_PER_S,
-        images=Images(e.images).name.lower() if Kind.of(e.kind) is Kind.CHECKPOINT else "",
+        images=Images(e.images).name.lower() if kind is Kind.CHECKPOINT else "",
         fork_reason=FORK_REASONS[e.fork_reason] if e.fork_reason > 1 else "",
         copied=e.copied,
         died_ns=e.died_ns,
@@ -283,7 +284,7 @@ def _event(e: Any) -> Event:
         fork_s=e.fork_ns / _NS_PER_S,
         threads_s=e.threads_ns / _NS_PER_S,
         age_s=e.age_ns / _NS_PER_S,
-        again=Again(e.again).words,
+        again=Again(e.again).words if e.again else "",
         input_dropped=e.dropped,
         error=_error(ffi.addressof(e, "error")) if e.error.code != Code.OK else None,
     )

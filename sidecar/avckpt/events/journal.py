@@ -9,6 +9,8 @@ from avckpt.bucket import Bucket
 from avckpt.events.record import EventRecord
 from avckpt.events.vocabulary import EXPECTED, Kind, Reason
 
+log = logging.getLogger("avckpt")
+
 SELDOM_S = 60.0
 """Failures that may recur at every interval (a checkpoint, a health check) are logged at most this often per
 container."""
@@ -121,7 +123,7 @@ class Journal:
             return logging.WARNING, record.message
         return LEVELS[kind], record.message
 
-    def _checkpoint(self, record: EventRecord) -> tuple[int, str]:
+    def _checkpoint(self, record: EventRecord) -> tuple[int, str] | None:
         self._unprotected = ""
         lacking = str(record.error) if record.error is not None else ""
         new, self._lacking = lacking != self._lacking, lacking
@@ -131,7 +133,8 @@ class Journal:
         if not self._held:
             self._held = True
             return logging.INFO, f"protected: first {record.message.replace(':', ',', 1)}"
-        return logging.DEBUG, record.message
+        # Nearly all events are this, and hardly anybody wants to read them.
+        return (logging.DEBUG, record.message) if log.isEnabledFor(logging.DEBUG) else None
 
     def _lost(self, record: EventRecord) -> tuple[int, str] | None:
         # The guard retries every interval: log it once per reason.

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
@@ -92,7 +92,7 @@ class Metrics:
         }
         self._maxima: dict[tuple[Histogram, str], float] = {}
         self._last_lost = self._gauge("avckpt_last_lost_seconds", "What the application lost by its last restore")
-        self._labels: dict[str, set[tuple[Counter | Gauge | Histogram, tuple[str, ...]]]] = {}
+        self._series: dict[str, dict[tuple[Counter | Gauge | Histogram, tuple[str, ...]], Any]] = {}
 
     def begin(self, container: str) -> None:
         """Creates the series of a container that is to be protected, at zero."""
@@ -130,8 +130,8 @@ class Metrics:
 
     def forget_all_but(self, containers: Iterable[str]) -> None:
         """Drops the series of forgotten containers; otherwise a year of new names would fill memory."""
-        for gone in set(self._labels) - set(containers):
-            for metric, labels in self._labels.pop(gone):
+        for gone in set(self._series) - set(containers):
+            for metric, labels in self._series.pop(gone):
                 metric.remove(*labels)
             for histogram in self._longest:
                 self._maxima.pop((histogram, gone), None)
@@ -153,8 +153,9 @@ class Metrics:
 
     def _observe(self, histogram: Histogram, container: str, seconds: float) -> None:
         self._of(histogram, container).observe(seconds)
-        longest = self._maxima[histogram, container] = max(seconds, self._maxima.get((histogram, container), 0.0))
-        self._of(self._longest[histogram], container).set(longest)
+        if seconds > self._maxima.get((histogram, container), -1.0):
+            self._maxima[histogram, container] = seconds
+            self._of(self._longest[histogram], container).set(seconds)
 
     def _counter(self, name: str, text: str, *labels: str) -> Counter:
         return Counter(name, text, ["container", *labels], registry=self._registry)
@@ -163,5 +164,8 @@ class Metrics:
         return Gauge(name, text, ["container"], registry=self._registry)
 
     def _of(self, metric: Metric, *labels: str) -> Metric:
-        self._labels.setdefault(labels[0], set()).add((metric, labels))
-        return metric.labels(*labels)
+        of_container = self._series.setdefault(labels[0], {})
+        series: Metric | None = of_container.get((metric, labels))
+        if series is None:
+            series = of_container[metric, labels] = metric.labels(*labels)
+        return series

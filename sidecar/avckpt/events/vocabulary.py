@@ -8,6 +8,7 @@ metrics use these names, and docs/events.md lists them.
 from __future__ import annotations
 
 import enum
+import functools
 import os
 import signal
 from typing import TypeVar
@@ -29,6 +30,7 @@ class _Named(str, enum.Enum):
         return member
 
     @classmethod
+    @functools.cache
     def of(cls: type[E], number: int) -> E:
         """The member with the engine's number.  Raises ValueError when there is none."""
         for member in cls:
