@@ -507,7 +507,8 @@ static void app_died(int status, uint64_t at_ns)
 	if (!told)
 		finish_unrestored("the guard does not read");
 	self.waiting = true;
-	self.deadline_ns = at_ns + self.wait_ms * NS_PER_MS;
+	/* The guard's time begins when it is told: without a CPU, that is long after the death. */
+	self.deadline_ns = now_ns() + self.wait_ms * NS_PER_MS;
 }
 
 static bool is_stop(int sig)
@@ -709,6 +710,17 @@ static void take_signals(void)
 	}
 }
 
+/* We may have got no CPU, or been stopped, between our last look and the deadline: what the guard
+ * has said meanwhile, it has said in time. */
+static void look_at_deadline(void)
+{
+	if (!self.waiting || now_ns() < self.deadline_ns)
+		return;
+	take_verdict();
+	if (self.waiting && now_ns() >= self.deadline_ns)
+		finish_unrestored("the guard did not answer in time");
+}
+
 /* Sleeps until there is something to do. */
 static void wait_event(void)
 {
@@ -723,11 +735,8 @@ static void wait_event(void)
 	uint64_t due_ns = UINT64_MAX, at_ns = now_ns();
 	struct timespec left;
 
-	if (self.waiting) {
-		if (at_ns >= self.deadline_ns)
-			finish_unrestored("the guard did not answer in time");
+	if (self.waiting)
 		due_ns = self.deadline_ns;
-	}
 	/* A child that fails to execute the program needs no protection. */
 	if (self.is_unit && self.fd[EXEC] < 0 && unit_due_ns() < due_ns)
 		due_ns = unit_due_ns();
@@ -834,6 +843,7 @@ int main(int argc, char **argv)
 			take_verdict();
 		reap();
 		continue_stopped();
+		look_at_deadline();
 		wait_event();
 		take_signals();
 	}

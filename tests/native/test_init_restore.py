@@ -309,6 +309,50 @@ def test_guard_that_says_it_is_at_work_is_waited_for() -> None:
         assert (time.monotonic_ns() - report.reaped_ns) / 1e9 > 0.39
 
 
+@SHARED
+@pytest.mark.skipif(not shutil.which("strace"), reason="strace keeps the CPU from init; it is not installed")
+def test_an_answer_that_init_is_late_to_read_was_in_time() -> None:
+    """It gets no CPU after its last look at the pipe, until the time of the guard, which has answered, is over."""
+    prefix = ["strace", "-qq", "-o", "/dev/null", "-e", "trace=wait4", "-e", "inject=wait4:delay_exit=600000"]
+    with Phoenix(options=["--wait-ms", "400"], prefix=prefix) as init, Guard(init) as guard:
+        pid = init.app_pid()
+        for seq in range(1, 4):
+            init.app.say("die 11")
+            assert guard.report().seq == seq
+            init.spawn(pid)
+            guard.answer(seq, Verdict.RESTORED)
+            init.go()
+            assert init.app_pid() == pid
+        init.app.say("exit 5")
+        assert guard.report().seq == 4
+        guard.answer(4, Verdict.GIVE_UP)
+        assert init.end() == 5
+        assert "the guard gave up" in init.error_text()
+
+
+@SHARED
+def test_a_guard_is_not_late_for_what_init_is_late_to_tell() -> None:
+    """The restored application dies while init, which gets no CPU, has yet to read that it was restored."""
+    with Phoenix(options=["--wait-ms", "400"]) as init, Guard(init) as guard:
+        pid = init.app_pid()
+        init.app.say("die 11")
+        assert guard.report().seq == 1
+        init.spawn(pid)
+        guard.answer(1, Verdict.WORKING)
+        os.kill(pid, signal.SIGKILL)
+        wait_until(lambda: state_of(pid) == "X", PATIENCE_S, "init has reaped it")
+        os.kill(init.pid, signal.SIGSTOP)
+        wait_until(lambda: state_of(init.pid) == "T", PATIENCE_S, "init's stop")
+        guard.answer(1, Verdict.RESTORED)
+        time.sleep(0.6)
+        os.kill(init.pid, signal.SIGCONT)
+        assert guard.report().seq == 2
+        init.spawn(pid)
+        guard.answer(2, Verdict.RESTORED)
+        init.go()
+        assert init.app_pid() == pid
+
+
 def test_default_wait() -> None:
     with Phoenix() as init, Guard(init) as guard:
         assert guard.ctl().wait_ms == 2000
