@@ -377,15 +377,15 @@ def meanwhile(command: Sequence[str], count: int = 1) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def injected(guard: GuardProcess, calls: str, what: str) -> Iterator[None]:
-    """strace does something to these system calls of the guard: inject=... of strace(1)."""
+def injected(whose: GuardProcess | Victim, calls: str, what: str) -> Iterator[None]:
+    """strace does something to these system calls of a guard, or of a victim's init: inject=... of strace(1)."""
     if not shutil.which("strace"):
-        pytest.skip("strace is what meddles with the guard's system calls; it is not installed")
-    status = Path(f"/proc/{guard.pid}/status")
+        pytest.skip("strace is what meddles with system calls; it is not installed")
+    status = Path(f"/proc/{whose.pid}/status")
     with subprocess.Popen(
         [
             *("strace", "-f", "-qq", "-o", "/dev/null", "-e", f"trace={calls}"),
-            *("-e", f"inject={calls}:{what}", "-p", str(guard.pid)),
+            *("-e", f"inject={calls}:{what}", "-p", str(whose.pid)),
         ],
         stderr=subprocess.DEVNULL,
     ) as strace:
