@@ -28,6 +28,7 @@
 #define FEW_PAGES 48     /* a round that leaves no more is the last         */
 #define READ_PAGE_NS 700 /* in a freeze                                     */
 #define AGE_NS (60 * NS_PER_S)
+#define PINNED_NS (60 * NS_PER_S)
 #define STALE_SHARE 2 /* if more than half of its own pages are stale, a fork is better   */
 #define COPIES_SHARE 2
 #define OWN_SHARE 8 /* more than this part of the process: it is to share more with the others */
@@ -156,6 +157,15 @@ static bool has_pinned(pid_t pid)
 	return line && strtoul(line + 7, NULL, 10) != 0;
 }
 
+/* A program that opens such files again and again has none open now and then; and what it is reading
+ * just then is not always seen (dirty_reads.c): it may be about to sleep. */
+static bool may_pin(struct process *process, const struct files *files)
+{
+	if (files_may_pin(files))
+		process->pinned_ns = now_ns();
+	return process->pinned_ns && now_ns() - process->pinned_ns < PINNED_NS;
+}
+
 static bool has_own_filter(const struct process *process)
 {
 	struct proc_status status;
@@ -175,7 +185,7 @@ static bool is_small(const struct process *process)
 }
 
 /* Why its memory is not even to be watched. */
-static enum avc_fork_reason why_not(const struct process *process, const struct attempt *attempt)
+static enum avc_fork_reason why_not(struct process *process, const struct attempt *attempt)
 {
 	const struct avc_config *config = attempt->config;
 
@@ -195,7 +205,7 @@ static enum avc_fork_reason why_not(const struct process *process, const struct 
 		return AVC_FORK_MEMORY;
 	/* Those of a table that it shares are not known here. */
 	if (process->shared & CLONE_FILES || has_pinned(process->pid) ||
-	    files_may_pin(process->files_before))
+	    may_pin(process, process->files_before))
 		return AVC_FORK_PINNED;
 	return AVC_FORK_NONE;
 }
@@ -350,7 +360,7 @@ int dirty_capture_one(struct dirty *dirty, const struct image *image, struct avc
 {
 	struct process *process = image->process;
 
-	if (files_may_pin(image->files))
+	if (may_pin(process, image->files))
 		return fork_instead(dirty, process, "some of its pages may be pinned", err);
 	if (!scan_stopped(dirty, process) || !copy_read(dirty, process))
 		return fork_instead(dirty, process, "it has just written too much", err);

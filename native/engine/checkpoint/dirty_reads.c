@@ -20,14 +20,15 @@ struct reads {
 	struct pageset *pages;
 };
 
+/* Or may be one: another thread can close what is being read. */
 static bool is_file(pid_t pid, uint64_t number)
 {
 	char name[24];
 	struct statx st;
 
 	snprintf(name, sizeof name, "fd/%u", (unsigned int)number);
-	return proc_look(pid, name, STATX_TYPE, &st) &&
-	       (S_ISREG(st.stx_mode) || S_ISBLK(st.stx_mode));
+	return !proc_look(pid, name, STATX_TYPE, &st) || S_ISREG(st.stx_mode) ||
+	       S_ISBLK(st.stx_mode);
 }
 
 static bool add(struct reads *reads, avc_remote start, size_t bytes)
