@@ -388,11 +388,23 @@ def test_each_process_of_a_tree_is_copied_by_itself(tmp_path: Path) -> None:
     [
         ("idle 1 1", "there is no older image yet"),
         ("sandbox", "it has a seccomp filter of its own"),
+        ("unsupported received", "it has memory of a kind that cannot be watched"),
     ],
 )
 def test_says_why_it_forks(command: str, reason: str, tmp_path: Path) -> None:
     with Victim(command, tmp_path) as victim, GuardProcess(BY_ITSELF, [victim.pid]) as guard:
         guard.wait_for(lambda event: event.get("fork_reason") == reason, reason)
+
+
+def test_a_file_open_for_direct_access_now_and_then(tmp_path: Path) -> None:
+    """A read of it that is under way is not always seen: there are forks also while none is open."""
+    reason = "a device may write to its memory"
+    with Victim("unsupported direct signal 0.3", tmp_path) as victim, GuardProcess(BY_ITSELF, [victim.pid]) as guard:
+        guard.wait_for(lambda event: event.get("images") == "dirty", "a copy")
+        victim.kill_app(signal.SIGUSR1)
+        guard.wait_for(lambda event: event.get("fork_reason") == reason, reason)
+        wait_until(lambda: victim.see().counter[0] == 0, PATIENCE_S, "it is closed")
+        assert how_made(guard, 5) == {reason}
 
 
 @pytest.mark.parametrize(("limit_mb", "how"), [(120, "memory for copies is short"), (300, "dirty"), (0, "dirty")])

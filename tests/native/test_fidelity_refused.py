@@ -40,6 +40,7 @@ def built(init_built: None, victims_built: Path) -> None:
     ("command", "why"),
     [
         ("unsupported iouring", "io_uring"),
+        ("unsupported ringonly", "io_uring"),
         ("unsupported aio", "kernel AIO (most programs do without: avckpt.io_uring=off)"),
         ("unsupported userfault", "userfaultfd"),
         ("unsupported nested", "a container in the container"),
@@ -96,7 +97,7 @@ def test_it_runs_unprotected_and_says_why(command: str, why: str, tmp_path: Path
 @pytest.mark.parametrize(
     ("kind", "why"),
     [
-        *(("iouring", "io_uring"), ("aio", "AIO"), ("userfault", "userfaultfd")),
+        *(("iouring", "io_uring"), ("aio", "AIO"), ("aioinstead", "AIO"), ("userfault", "userfaultfd")),
         ("nested", "a container in the container"),
         ("strict", "strict mode"),
         pytest.param("dispatch", "Syscall User Dispatch", marks=DISPATCH),

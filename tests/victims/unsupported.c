@@ -6,7 +6,11 @@
  * is as it says.
  *
  *   iouring   has an io_uring
+ *   ringonly  has an io_uring that is mapped and has no descriptor
  *   aio       has a kernel AIO context
+ *   aioinstead  the same, and as much less of other memory
+ *   received  has memory in which a TCP socket puts what it receives
+ *   direct    has a file open for O_DIRECT
  *   traced    somebody else traces it
  *   sysvshm   has a SysV shared memory segment attached
  *   sysvsem   has SysV semaphores with undo
@@ -65,7 +69,7 @@
 #include "victim.h"
 
 static int fd = -1, pipe_fd[2];
-static void *memory;
+static void *memory, *room;
 static aio_context_t aio;
 
 static bool start_iouring(void)
@@ -73,6 +77,28 @@ static bool start_iouring(void)
 	struct io_uring_params params = { 0 };
 
 	fd = (int)syscall(SYS_io_uring_setup, 4, &params);
+	return fd >= 0;
+}
+
+static bool start_ringonly(void)
+{
+	if (!start_iouring())
+		return false;
+	memory = mmap(NULL, 4096, PROT_READ, MAP_SHARED, fd, IORING_OFF_SQ_RING);
+	close(fd);
+	return memory != MAP_FAILED;
+}
+
+static bool start_received(void)
+{
+	fd = socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
+	memory = mmap(NULL, 4096, PROT_READ, MAP_SHARED, fd, 0);
+	return memory != MAP_FAILED;
+}
+
+static bool start_direct(void)
+{
+	fd = open("/proc/self/exe", O_RDONLY | O_DIRECT | O_CLOEXEC);
 	return fd >= 0;
 }
 
@@ -90,6 +116,23 @@ static void stop_fd(void)
 static bool start_aio(void)
 {
 	return syscall(SYS_io_setup, 4, &aio) == 0;
+}
+
+static bool start_aioinstead(void)
+{
+	unsigned long start, end;
+	char line[512];
+	FILE *maps;
+
+	if (!start_aio())
+		return false;
+	maps = fopen("/proc/self/maps", "re");
+	must(maps != NULL, "/proc/self/maps");
+	while (fgets(line, sizeof line, maps))
+		if (strstr(line, "[aio]") && sscanf(line, "%lx-%lx", &start, &end) == 2)
+			must(!munmap(room, end - start), "munmap");
+	fclose(maps);
+	return true;
 }
 
 static void stop_aio(void)
@@ -627,7 +670,11 @@ static const struct kind {
 	void (*stop)(void);
 } kinds[] = {
 	{ "iouring", start_iouring, stop_fd },
+	{ "ringonly", start_ringonly, NULL },
 	{ "aio", start_aio, stop_aio },
+	{ "aioinstead", start_aioinstead, NULL },
+	{ "received", start_received, NULL },
+	{ "direct", start_direct, stop_fd },
 	{ "traced", start_traced, NULL },
 	{ "sysvshm", start_sysvshm, stop_sysvshm },
 	{ "sysvsem", start_sysvsem, NULL },
@@ -681,6 +728,7 @@ int main(int argc, char **argv)
 	from_ns = on_signal ? UINT64_MAX
 			    : now_ns() + (uint64_t)((argc > 2 ? atof(argv[2]) : 0) * 1e9);
 	board->counter[0] = 0;
+	room = victim_memory(1 << 20, false);
 	while (now_ns() < from_ns || !board->counter[0]) {
 		if (on_signal && sigtimedwait(&usr1, NULL, &(struct timespec){ 0 }) == SIGUSR1)
 			from_ns = now_ns();

@@ -33,11 +33,7 @@ static int check_mapping(const struct mapping *m, void *arg)
 {
 	const char **reason = arg;
 
-	if (!strncmp(m->name, "/[aio]", 6))
-		*reason = "it uses kernel AIO (most programs do without: avckpt.io_uring=off)";
-	/* Those of files are found in the first clone. */
-	if (!m->shared && !m->offset && !strncmp(m->name, "/anon_hugepage", 14))
-		*reason = memory_private_huge_pages;
+	*reason = memory_refuses(m);
 	return *reason ? -1 : 0;
 }
 

@@ -31,9 +31,21 @@
 
 #define MSEAL 462 /* mseal(2), since Linux 6.10; the headers may be older */
 
-const char memory_private_huge_pages[] =
-	"it has private huge pages (hugetlb): a clone shares them, and the application could be "
-	"killed for want of another when it writes to one";
+const char *memory_refuses(const struct mapping *m)
+{
+	if (!strncmp(m->name, "/[aio]", 6))
+		return "it uses kernel AIO (most programs do without: avckpt.io_uring=off)";
+	/* Its descriptor may be closed. */
+	if (!strncmp(m->name, "anon_inode:[io_uring]", 21))
+		return "it uses io_uring (most programs do without: avckpt.io_uring=off)";
+	/* The pool of these is small, and a process that writes to a shared one when it is empty is
+	 * killed.  Those of files are found in the first clone, by the flag. */
+	if (!m->shared &&
+	    (m->flags & MAPPING_HUGETLB || (!m->offset && !strncmp(m->name, "/anon_hugepage", 14))))
+		return "it has private huge pages (hugetlb): a clone shares them, and the "
+		       "application could be killed for want of another when it writes to one";
+	return NULL;
+}
 
 struct memory *memory_new(void)
 {
@@ -267,7 +279,7 @@ bool memory_needs_fork(const struct process *process)
 	for (uint32_t i = 0; i < memory->kinds.count; i++)
 		if (memory->kinds.area[i].flags & (MAPPING_KEYS | MAPPING_TAGGED))
 			return true;
-	return memory->dontfork || memory->grows;
+	return memory->dontfork || memory->grows || memory->receives;
 }
 
 /* ---- mappings, from /proc ------------------------------------------------------------ */

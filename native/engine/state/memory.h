@@ -88,6 +88,7 @@ struct memory {
 	struct marks kinds; /* as mem_image.kinds                              */
 	bool special;       /* the same                                        */
 	bool grows;         /* some, other than its stack, grows downwards     */
+	bool receives;      /* a socket replaces pages of it: TCP_ZEROCOPY_RECEIVE     */
 	int64_t locked_kb;
 	uint64_t locked_layout, locked_read_ns, locked_cost_ns;
 };

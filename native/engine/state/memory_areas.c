@@ -47,7 +47,8 @@ struct survey {
 	struct areas areas, foreign, unkept;
 	uint64_t layout, shared_bytes, since;
 	uint64_t left_bytes, others_bytes;
-	bool private_huge, too_many, lost_some, unforked;
+	const char *refused;
+	bool too_many, lost_some, unforked;
 	bool recycled; /* image.recycled                                             */
 	struct mounts mounts;
 	struct leases leases;
@@ -215,10 +216,12 @@ static int find_area(const struct mapping *m, void *arg)
 		survey->memory->special |= mapping_is_special(m);
 		survey->memory->grows |= m->flags & MAPPING_GROWING &&
 					 strcmp(m->name, "[stack]") != 0;
+		survey->memory->receives |= !strncmp(m->name, "socket:", 7);
 		if (survey->process->descendant || survey->recycled)
 			marks_add(&survey->memory->advised, m, advice_of(m));
 	}
-	survey->private_huge |= m->flags & MAPPING_HUGETLB && !m->shared;
+	if (!survey->refused)
+		survey->refused = memory_refuses(m);
 	segment = !wiped && mapping_is_segment(m);
 	named = segment || (!wiped && has_name(m) && is_memory(survey, m));
 	if ((!wiped && !is_shared(m) && !named) || is_of_parasite(survey->process, m->start))
@@ -356,7 +359,7 @@ static int read_areas(struct survey *survey, const struct areas *copied, struct 
 	int result = 0;
 
 	memory->advised.count = memory->kinds.count = 0;
-	memory->special = memory->grows = false;
+	memory->special = memory->grows = memory->receives = false;
 	/* Advice given to the process since its template was forked is missing in the template. */
 	if (proc_mappings(survey->recycled ? pid : survey->template, "smaps", find_area, survey))
 		return fail_errno(err, survey->template, "keep memory", "read(smaps)",
@@ -374,9 +377,9 @@ static int read_areas(struct survey *survey, const struct areas *copied, struct 
 	survey->unkept = (struct areas){ 0 };
 	if (survey->lost_some)
 		return fail_errno(err, 0, "keep memory", "realloc", "out of memory");
-	if (survey->private_huge)
+	if (survey->refused)
 		result = fail(err, AVC_UNSUPPORTED, 0, pid, "keep memory", "", "%s",
-			      memory_private_huge_pages);
+			      survey->refused);
 	else if (survey->too_many)
 		result = fail(err, AVC_UNSUPPORTED, 0, pid, "keep memory", "",
 			      "it has more than %d areas of shared or MADV_WIPEONFORK memory",

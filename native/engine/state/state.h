@@ -271,10 +271,9 @@ void memory_advise(const struct process *process, uint32_t slot, int advice, str
 /* The template is smaller than the app: always fails, with AVC_RETRY if the next attempt can
  * succeed. */
 int memory_learn(struct process *process, long missing_pages, struct avc_error *err);
+/* Why a process that has this mapping cannot be protected; NULL: it can. */
+const char *memory_refuses(const struct mapping *m);
 /* When the app runs again.  Fails with AVC_RETRY if what had to be copied was not. */
-/* Why a process that has private mappings of hugetlbfs is not cloned: the pool of huge pages is
- * small, and a process that writes to a shared one when it is empty is killed. */
-extern const char memory_private_huge_pages[];
 int memory_finish(struct image *image, int64_t locked_kb, struct setup *setup,
 		  struct avc_error *err) warn_unused;
 /* Whether only a fork preserves its properties: advice, protection keys, growth. */
