@@ -228,8 +228,7 @@ struct process {
 	bool asked;
 	uint32_t blocks;     /* of the slot, that its threads take up in this freeze     */
 	long surveyed_pages; /* size when its mappings were last read           */
-	uint64_t
-		pinned_ns; /* when a descriptor was last seen that may pin pages: files_may_pin() */
+	uint64_t pinned_ns;  /* when files_may_pin() was last true: dirty.c             */
 	int sockets[SOCKETS_MAX];
 	uint32_t socket_count;
 	struct pending *pending;
