@@ -377,14 +377,17 @@ def meanwhile(command: Sequence[str], count: int = 1) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def injected(whose: GuardProcess | Victim, calls: str, what: str) -> Iterator[None]:
-    """strace does something to these system calls of a guard, or of a victim's init: inject=... of strace(1)."""
+def injected(whose: GuardProcess | Victim, calls: str, what: str, log: Path = Path("/dev/null")) -> Iterator[None]:
+    """strace does something to these system calls of a guard, or of a victim's init: inject=... of strace(1).
+
+    It writes them to `log`.
+    """
     if not shutil.which("strace"):
         pytest.skip("strace is what meddles with system calls; it is not installed")
     status = Path(f"/proc/{whose.pid}/status")
     with subprocess.Popen(
         [
-            *("strace", "-f", "-qq", "-o", "/dev/null", "-e", f"trace={calls}"),
+            *("strace", "-f", "-qq", "-o", str(log), "-e", f"trace={calls}"),
             *("-e", f"inject={calls}:{what}", "-p", str(whose.pid)),
         ],
         stderr=subprocess.DEVNULL,

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config
+from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config, injected, since_linux
 from testkit.harness import app_pid, wait_until
 from testkit.init_peer import Init
 
@@ -49,6 +49,27 @@ def test_it_sleeps(tmp_path: Path) -> None:
             before = wake_ups(guard.pid)
             time.sleep(SLEEPS_S)
             assert wake_ups(guard.pid) - before <= WAKES, command
+
+
+@since_linux(6, 11, "numbers of mounts and their namespaces that are never given twice")
+def test_mounts_are_read_when_they_have_changed(tmp_path: Path) -> None:
+    """To read them costs more than anything else in a checkpoint of a small process."""
+    log = tmp_path / "calls"
+    with Victim("idle 1 1 --beat-us 1000", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        mnt = Path(f"/proc/{victim.app}/ns/mnt")
+
+        def reads(checkpoints: int) -> int:
+            with injected(guard, "openat", "delay_enter=1", log):
+                for _ in range(checkpoints):
+                    assert guard.checkpoint()["kind"] == "checkpoint"
+            return log.read_text().count("/mountinfo")
+
+        assert guard.checkpoint()["kind"] == "checkpoint"
+        assert reads(3) == 0
+        subprocess.run(["nsenter", f"--mount={mnt}", "mount", "-t", "tmpfs", "none", "/mnt"], check=True)
+        assert reads(3) == 1
+        subprocess.run(["nsenter", f"--mount={mnt}", "umount", "/mnt"], check=True)
+        assert reads(3) == 1
 
 
 def exec_until_closed_s(fifo: Path) -> float:
