@@ -277,6 +277,23 @@ def test_a_template_is_in_the_applications_landlock_domain(tmp_path: Path) -> No
             assert victim.see().counter[0] == domains
 
 
+@since_linux(6, 10, "mseal")
+def test_what_it_has_sealed_since_the_template_was_forked(tmp_path: Path) -> None:
+    """Part of a mapping: the template, which lacks that, has not been split there."""
+    with Victim("sealer 40", tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
+        for pages in range(1, 9):
+            until_copied(guard)
+            os.kill(victim.app, signal.SIGUSR1)
+            wait_until(partial(lambda n: victim.see().counter[0] == n, pages), PATIENCE_S, "it has sealed one more")
+            checkpoint(guard)
+            since = guard.mark()
+            victim.kill_app()
+            guard.wait("restored", since=since)
+            victim.wait_beats(5)
+            assert victim.see().counter[0] == pages
+        victim.check()
+
+
 def until_near(guard: GuardProcess) -> Json:
     """Until the last two checkpoints were copies: then an older template can take the newest one's place."""
     before = until_copied(guard)

@@ -401,10 +401,13 @@ static int check_layout(const struct image *image, struct avc_error *err)
 	const uint64_t start = now_ns();
 	int result;
 
+	/* A template that copies were made to has no seal or advice that the process has given to a
+	 * part of a mapping since, and so is not split there. */
 	if (memory->layout && start - memory->read_ns < memory->cost_ns * SMAPS_SHARE) {
-		if (proc_mappings(image->template, "maps", hash_mapping, &survey))
-			return fail_errno(err, image->template, "keep memory", "read(maps)",
-					  "it was killed");
+		const pid_t pid = image->recycled ? process->pid : image->template;
+
+		if (proc_mappings(pid, "maps", hash_mapping, &survey))
+			return fail_errno(err, pid, "keep memory", "read(maps)", "it was killed");
 		if (survey.layout == memory->layout)
 			return 0;
 	}
