@@ -404,13 +404,22 @@ def test_each_process_of_a_tree_is_copied_by_itself(tmp_path: Path) -> None:
     ("command", "reason"),
     [
         ("idle 1 1", "there is no older image yet"),
-        ("sandbox", "it has a seccomp filter of its own"),
+        ("sandbox", "it has a seccomp filter of its own, or is not dumpable"),
         ("unsupported received", "it has memory of a kind that cannot be watched"),
     ],
 )
 def test_says_why_it_forks(command: str, reason: str, tmp_path: Path) -> None:
     with Victim(command, tmp_path) as victim, GuardProcess(BY_ITSELF, [victim.pid]) as guard:
         guard.wait_for(lambda event: event.get("fork_reason") == reason, reason)
+
+
+def test_children_that_end_are_not_said_to_have_filters(tmp_path: Path) -> None:
+    """Nor memory that cannot be watched: of one that ends just then nothing can be read."""
+    with Victim("churn 3 --life-ms 60", tmp_path) as victim, GuardProcess(BY_ITSELF, [victim.pid]) as guard:
+        reason = "it is new, or has just ended, or a process above it adopts orphans"
+        guard.wait_for(lambda event: event.get("fork_reason") == reason, reason, count=12)
+        told = {event.get("fork_reason", "") for event in guard.events}
+        assert not [text for text in told if "filter" in text or "watch" in text or "device" in text]
 
 
 def test_a_file_open_for_direct_access_now_and_then(tmp_path: Path) -> None:

@@ -166,13 +166,10 @@ static bool may_pin(struct process *process, const struct files *files)
 	return process->pinned_ns && now_ns() - process->pinned_ns < PINNED_NS;
 }
 
-static bool has_own_filter(const struct process *process)
+static bool has_own_filter(const struct process *process, const struct proc_status *status)
 {
-	struct proc_status status;
-
 	return process->parasite.seccomp == SECCOMP_SUPERVISED ||
-	       proc_status_of(process->status_fd, process->pid, &status) ||
-	       !seccomp_is_containers(&status, process->plain_filters);
+	       !seccomp_is_containers(status, process->plain_filters);
 }
 
 /* A fork of it takes less than a millisecond, hardly more than the queries that a copy needs. */
@@ -184,18 +181,27 @@ static bool is_small(const struct process *process)
 	       anonymous < (process->tracker ? DIRTY_SMALL_PAGES / 2 : DIRTY_SMALL_PAGES);
 }
 
+/* Nothing can be read any more of a process that has ended since the tree was read, and all fails
+ * that is tried with it. */
+static enum avc_fork_reason unless_ended(const struct process *process, enum avc_fork_reason reason)
+{
+	return proc_is_exiting(process->pid) ? AVC_FORK_PROCESSES : reason;
+}
+
 /* Why its memory is not even to be watched. */
 static enum avc_fork_reason why_not(struct process *process, const struct attempt *attempt)
 {
 	const struct avc_config *config = attempt->config;
+	struct proc_status status;
 
 	if (config->images == AVC_IMAGES_FORK)
 		return AVC_FORK_CONFIG;
-	if (!process->infected || process->adopts)
+	if (!process->infected || process->adopts ||
+	    proc_status_of(process->status_fd, process->pid, &status))
 		return AVC_FORK_PROCESSES;
 	/* Nothing tells whether one that is not dumpable has entered a Landlock domain
 	 * (inherited.c). */
-	if (has_own_filter(process) || process->undumpable)
+	if (has_own_filter(process, &status) || process->undumpable)
 		return AVC_FORK_SANDBOX;
 	if (config->images == AVC_IMAGES_AUTO && is_small(process))
 		return AVC_FORK_SMALL;
@@ -206,7 +212,7 @@ static enum avc_fork_reason why_not(struct process *process, const struct attemp
 	/* Those of a table that it shares are not known here. */
 	if (process->shared & CLONE_FILES || has_pinned(process->pid) ||
 	    may_pin(process, process->files_before))
-		return AVC_FORK_PINNED;
+		return unless_ended(process, AVC_FORK_PINNED);
 	return AVC_FORK_NONE;
 }
 
@@ -238,18 +244,20 @@ static enum avc_fork_reason watch(struct dirty *dirty, struct process *process, 
 	if (process->tracker && (process->tracker->over || process->tracker->broken))
 		tracker_end(process);
 	if (!process->tracker) {
-		if (dirty->refused_nonce == process->nonce || !process->holder)
+		if (dirty->refused_nonce == process->nonce)
 			return AVC_FORK_KERNEL;
+		if (!process->holder)
+			return AVC_FORK_PROCESSES;
 		if (tracker_begin(process, timer, &refused)) {
 			if (refused.code == AVC_UNSUPPORTED)
 				dirty->refused_nonce = process->nonce;
-			return AVC_FORK_KERNEL;
+			return unless_ended(process, AVC_FORK_KERNEL);
 		}
 	}
 	if (watch_mappings(dirty, process))
 		return AVC_FORK_NONE;
 	tracker_end(process);
-	return AVC_FORK_MEMORY;
+	return unless_ended(process, AVC_FORK_MEMORY);
 }
 
 static enum avc_fork_reason why_not_idle(struct dirty *dirty, const struct process *process)

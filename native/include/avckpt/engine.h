@@ -61,7 +61,7 @@ enum avc_fork_reason {
 	AVC_FORK_NONE = 0,      /* it was not                                      */
 	AVC_FORK_CONFIG = 1,    /* AVC_IMAGES_FORK                                 */
 	AVC_FORK_FIRST = 2,     /* there is no older one to be used yet */
-	AVC_FORK_PROCESSES = 3, /* a process above it adopts orphans, or it is new */
+	AVC_FORK_PROCESSES = 3, /* it is new, or has ended, or one above it adopts orphans */
 	AVC_FORK_KERNEL = 4,    /* the kernel cannot watch memory (before 6.7)     */
 	AVC_FORK_SANDBOX = 5,   /* it has a seccomp filter of its own, or is not dumpable */
 	AVC_FORK_MEMORY = 6,    /* of a kind that cannot be watched or copied      */
