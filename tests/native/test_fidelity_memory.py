@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -132,15 +134,41 @@ def test_the_next_guard_cuts_no_nap_short(tmp_path: Path) -> None:
         victim.wait_beats()
 
 
+@contextlib.contextmanager
+def large(tmp_path: Path) -> Iterator[Victim]:
+    """A victim that others could find 64 MB of: it has a name in /dev/shm."""
+    with Victim("mappings 64 --large", tmp_path) as victim:
+        path = re.search(r"/dev/shm/victim-large-\w+", Path(f"/proc/{victim.app}/maps").read_text())
+        assert path
+        try:
+            yield victim
+        finally:
+            os.unlink(path[0])
+
+
 def test_more_shared_memory_than_allowed_is_left_alone_and_told(tmp_path: Path) -> None:
     with (
         Victim("idle 0 1", tmp_path) as plain,
-        Victim("mappings 8000 --inherited", tmp_path) as victim,
+        large(tmp_path) as victim,
         GuardProcess(config(0.05), [plain.pid, victim.pid]) as guard,
     ):
         told = guard.wait("checkpoint", cookie=2)["error"]["message"]
-        assert "8000 kB of shared memory are more than avckpt.shm allows" in told
+        assert "65536 kB of shared memory are more than avckpt.shm allows" in told
         assert not guard.wait("checkpoint", cookie=1).get("error")
+
+
+@pytest.mark.parametrize("kind", ["--inherited", "--segment", "--memfd"])
+def test_more_shared_memory_than_allowed_that_nobody_else_has(kind: str, tmp_path: Path) -> None:
+    """Refused: it is the process's own state, as the heap of Java's ZGC, which crashed after each restore."""
+    with Victim(f"mappings 8000 {kind}", tmp_path) as victim:
+        with GuardProcess(config(), [victim.pid]) as guard:
+            answer = guard.checkpoint()
+            assert answer["kind"] == "unprotected", answer
+            assert "8000 kB of shared memory that nobody else has" in answer["error"]["message"]
+        with GuardProcess(config(shm_bytes=0), [victim.pid]) as guard:  # its user takes it for no state
+            assert "8000 kB of shared memory are more" in guard.checkpoint()["error"]["message"]
+        with GuardProcess(config(0.1, shm_bytes=8_192_000), [victim.pid]) as guard:
+            kill_at_random(guard, victim, 5, (0.01, 0.3))
 
 
 @pytest.mark.parametrize(("megabytes", "kind"), [(8, "unprotected"), (2, "checkpoint")])
@@ -156,7 +184,7 @@ def test_more_shared_memory_than_allowed_of_several_processes(megabytes: int, ki
 
 
 def test_small_shared_memory_is_rolled_back_beside_a_large_one(tmp_path: Path) -> None:
-    with Victim("mappings 64 --large", tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
+    with large(tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
         assert "65536 kB of shared memory" in guard.wait("checkpoint")["error"]["message"]
         kill_at_random(guard, victim, 10, (0.01, 0.15))
 

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * mappings [SHARED_KB] [--inherited] [--huge] [--segment] [--future] [--large] [--unbound]: memory of
- * every kind a plain fork does not carry as it is, and kinds that are easily forgotten.  Each
+ * mappings [SHARED_KB] [--inherited] [--huge] [--segment] [--memfd] [--future] [--large]
+ * [--unbound]: memory of every kind a plain fork does not carry as it is, and kinds that are easily forgotten.  Each
  * is written and read all the time.
  *
  * - anonymous, MADV_DONTFORK: not in a fork at all (V8 marks its heap so)
@@ -17,8 +17,8 @@
  * - mappings that come and go all the time
  *
  * With --inherited the first two are ordinary memory; with --huge the shared memory is of
- * huge pages, with --segment System V's; with --large there are 64 MB more of shared memory, of which nothing is
- * expected; with --future all memory that comes is locked (mlockall); with --unbound no area
+ * huge pages, with --segment System V's, with --memfd a memfd's; with --large there are 64 MB more of
+ * shared memory that others can find in /dev/shm, of which nothing is expected; with --future all memory that comes is locked (mlockall); with --unbound no area
  * has a policy.
  */
 #include <linux/mempolicy.h>
@@ -60,6 +60,17 @@ static void *attach(size_t bytes)
 	void *at = id < 0 ? (void *)-1 : shmat(id, NULL, 0);
 
 	must(at != (void *)-1 && !shmctl(id, IPC_RMID, NULL), "shmat");
+	return at;
+}
+
+static void *map_file(int fd, size_t bytes)
+{
+	void *at = MAP_FAILED;
+
+	if (fd >= 0 && !ftruncate(fd, (off_t)bytes))
+		at = mmap(NULL, bytes, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
+	must(at != MAP_FAILED, "mmap");
+	close(fd);
 	return at;
 }
 
@@ -178,18 +189,20 @@ int main(int argc, char **argv)
 	size_t shared_kb, lap;
 	uint64_t *read_only, *none, *heap;
 	char *brk_at;
-	bool inherited, huge, segment, large, unbound;
+	bool inherited, huge, segment, memfd, large, unbound;
 	int n = 0, fd;
 
 	inherited = victim_flag(&argc, argv, "--inherited");
 	huge = victim_flag(&argc, argv, "--huge");
 	segment = victim_flag(&argc, argv, "--segment");
 	future = victim_flag(&argc, argv, "--future");
+	memfd = victim_flag(&argc, argv, "--memfd");
 	large = victim_flag(&argc, argv, "--large");
 	unbound = victim_flag(&argc, argv, "--unbound");
 	victim_start(
 		&argc, argv, 0,
-		"[SHARED_KB] [--inherited] [--huge] [--segment] [--future] [--large] [--unbound]");
+		"[SHARED_KB] [--inherited] [--huge] [--segment] [--memfd] [--future] [--large] "
+		"[--unbound]");
 	shared_kb = argc > 1 ? (size_t)atol(argv[1]) : 64;
 	sigaction(SIGSEGV, &act, NULL);
 
@@ -218,6 +231,7 @@ int main(int argc, char **argv)
 	regions[n++] = (struct region){ "the heap", heap, BYTES / 8 };
 	if (shared_kb) {
 		void *at = segment ? attach(shared_kb << 10)
+			   : memfd ? map_file(memfd_create("heap", MFD_CLOEXEC), shared_kb << 10)
 				   : mmap(NULL, shared_kb << 10, PROT_READ | PROT_WRITE,
 					  MAP_SHARED | MAP_ANONYMOUS | (huge ? MAP_HUGETLB : 0), -1,
 					  0);
@@ -226,9 +240,8 @@ int main(int argc, char **argv)
 		regions[n++] = (struct region){ "shared memory", at, (shared_kb << 10) / 8 };
 	}
 	/* Below the other, so that it is found first. */
-	must(!large || mmap(NULL, 64 << 20, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1,
-			    0) != MAP_FAILED,
-	     "mmap");
+	if (large)
+		map_file(mkstemp((char[]){ "/dev/shm/victim-large-XXXXXX" }), 64 << 20);
 	mark_kinds(unbound);
 	read_only = map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
 	read_only[3] = 333;

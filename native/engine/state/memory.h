@@ -28,6 +28,7 @@ struct area {
 	bool named;         /* other processes can have it as well */
 	bool as_file;       /* ... or open by that name                                */
 	bool linked;        /* which it had at the checkpoint                          */
+	bool found;         /* others can find it later: by a name in /dev/shm, or a System V key */
 	bool again;         /* another process of the app has it, too, and its image keeps it */
 	bool left;          /* no room for it */
 	uint8_t protection; /* as mmap(2) has it                                     */

@@ -90,6 +90,17 @@ static bool has_name(const struct mapping *m)
 	return m->shared && m->inode && name && strncmp(name, "avckpt-kept", 11) != 0;
 }
 
+/* Others can still come to have it, without being given a descriptor. */
+static bool can_be_found(const struct mapping *m, bool segment)
+{
+	const size_t length = strlen(m->name), tail = strlen(" (deleted)");
+
+	if (segment)
+		return strncmp(m->name, "/SYSV00000000", 13) != 0;
+	return !strncmp(m->name, "/dev/shm/", 9) &&
+	       !(length > tail && !strcmp(m->name + length - tail, " (deleted)"));
+}
+
 bool mapping_is_segment(const struct mapping *m)
 {
 	return m->shared && device_is_memory(m->device) && !strncmp(m->name, "/SYSV", 5);
@@ -240,6 +251,7 @@ static int find_area(const struct mapping *m, void *arg)
 		.named = named,
 		/* Any process that sees the file system can open it. */
 		.as_file = named && !segment && !device_is_memory(m->device),
+		.found = can_be_found(m, segment),
 		.protection = (uint8_t)mapping_protection(m),
 		.way = m->mode[1] == 'w' ? WAY_MAPPING : WAY_NONE,
 	};
@@ -433,7 +445,7 @@ static int check_layout(const struct image *image, struct avc_error *err)
 struct unkept {
 	uint64_t device, inode, bytes;
 	pid_t pid;
-	bool written;
+	bool written, found;
 };
 
 struct unkept_list {
@@ -460,6 +472,7 @@ static bool add_unkept(struct unkept_list *list, const struct process *process,
 				.bytes = area_bytes(a),
 				.pid = process->pid,
 				.written = a->way != WAY_NONE,
+				.found = a->found,
 			};
 		}
 	}
@@ -496,8 +509,22 @@ static const struct unkept *find_common(const struct unkept_list *list)
 	return NULL;
 }
 
+/* What one process has to itself is its own state, like a heap that it has mapped from a memfd (Java
+ * with ZGC): registers, stacks and the rest would go back, and meet its contents of now.  What others
+ * can find is mostly messages to them. */
+static uint64_t own_bytes(const struct unkept_list *list)
+{
+	uint64_t bytes = 0;
+
+	for (uint32_t i = 0; i < list->count; i++)
+		if (list->item[i].written && !list->item[i].found)
+			bytes += list->item[i].bytes;
+	return bytes;
+}
+
 int memory_check_unkept(const struct image *image, uint32_t images, struct avc_error *err)
 {
+	const uint64_t limit = image->process->shm_bytes;
 	struct unkept_list list = { 0 };
 	const struct unkept *common;
 	bool added = true;
@@ -517,6 +544,13 @@ int memory_check_unkept(const struct image *image, uint32_t images, struct avc_e
 				     "several of its processes share memory (one area has %llu kB) "
 				     "that is more than avckpt.shm allows",
 				     (unsigned long long)common->bytes / 1024);
+		/* 0: the user wants none to be rolled back. */
+		else if (limit && own_bytes(&list))
+			result = fail(err, AVC_UNSUPPORTED, 0, image->process->pid, "keep memory",
+				      "",
+				      "%llu kB of shared memory that nobody else has are more than "
+				      "avckpt.shm allows",
+				      (unsigned long long)own_bytes(&list) / 1024);
 	}
 	free(list.item);
 	return result;

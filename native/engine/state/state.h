@@ -278,8 +278,9 @@ int memory_finish(struct image *image, int64_t locked_kb, struct setup *setup,
 		  struct avc_error *err) warn_unused;
 /* Whether only a fork preserves its properties: advice, protection keys, growth. */
 bool memory_needs_fork(const struct process *process);
-/* When all exist: -1 if several processes have shared memory that is not rolled back with them.  One
- * that goes back would wait for what another one has done already. */
+/* When all exist: -1 if there is shared memory that is not rolled back although several processes
+ * have it, of which one that goes back would wait for what another one has done already; or although
+ * only one has it, whose own state it is. */
 int memory_check_unkept(const struct image *image, uint32_t images,
 			struct avc_error *err) warn_unused;
 /* When all of a checkpoint are finished: fails if that is more than may be kept. */
