@@ -12,6 +12,7 @@ import pytest
 from testkit.guarded import GuardProcess, Victim, config, forks_beside, kill_at_random
 from testkit.harness import wait_until
 from testkit.procfs import children_of, comm_of, inside, status_of
+from testkit.seccomp import refusing
 
 pytestmark = pytest.mark.shared_machine(
     "supervised processes stop at each call: a checkpoint that comes too late drops the generations"
@@ -137,3 +138,14 @@ def test_none_runs_without_its_filters(kind: str, tmp_path: Path) -> None:
                 break
         assert end["kind"] == "gave_up"
         assert end["error"]["syscall"] == "seccomp"
+
+
+def test_children_found_in_a_freeze_are_under_filters(tmp_path: Path) -> None:
+    """Those of the container, as everything there: make -j4 had 2 checkpoints of 21."""
+    with (
+        Victim("churn 8", tmp_path, preexec=refusing("userfaultfd")) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        seen = guard.burst(100)
+        assert not [reason for reason in seen["reasons"] if "filters have just changed" in reason], seen
+        victim.wait_beats()

@@ -19,11 +19,21 @@
 /* One that was found while everything was stopped is not infected yet. */
 static int prepare_stopped(struct tree *tree, struct process *process, struct avc_error *err)
 {
+	struct proc_status status;
+
 	if (process->pid != process->leader)
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "freeze", "",
 			    "the main thread of process %d has ended", process->inside);
-	if (!process->infected && process_infect_stopped(process, tree->slots, err))
-		return -1;
+	if (!process->infected) {
+		/* Nobody has counted them yet (support_check()): 0 would look afterwards as if it had
+		 * got some since. */
+		if (proc_status_of(process->status_fd, process->pid, &status))
+			return fail_errno(err, process->pid, "freeze", "open(status)",
+					  "it has ended");
+		process->filters = status.seccomp_filters;
+		if (process_infect_stopped(process, tree->slots, err))
+			return -1;
+	}
 	return process->files_image ? 0 : files_prepare(process, NULL, err);
 }
 
