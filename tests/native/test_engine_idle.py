@@ -15,6 +15,7 @@ import pytest
 from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config, injected, since_linux
 from testkit.harness import app_pid, wait_until
 from testkit.init_peer import Init
+from testkit.scenario import checkpoint
 
 SLEEPS_S = 6.0
 """Two of the guard's longest sleeps (AVC_HEARTBEAT_NS)."""
@@ -55,16 +56,17 @@ def test_it_sleeps(tmp_path: Path) -> None:
 def test_mounts_are_read_when_they_have_changed(tmp_path: Path) -> None:
     """To read them costs more than anything else in a checkpoint of a small process."""
     log = tmp_path / "calls"
-    with Victim("idle 1 1 --beat-us 1000", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+    patient = config(freeze_deadline_s=PATIENCE_S)
+    with Victim("idle 1 1 --beat-us 1000", tmp_path) as victim, GuardProcess(patient, [victim.pid]) as guard:
         mnt = Path(f"/proc/{victim.app}/ns/mnt")
 
         def reads(checkpoints: int) -> int:
             with injected(guard, "openat", "delay_enter=1", log):
                 for _ in range(checkpoints):
-                    assert guard.checkpoint()["kind"] == "checkpoint"
+                    checkpoint(guard)
             return log.read_text().count("/mountinfo")
 
-        assert guard.checkpoint()["kind"] == "checkpoint"
+        checkpoint(guard)
         assert reads(3) == 0
         subprocess.run(["nsenter", f"--mount={mnt}", "mount", "-t", "tmpfs", "none", "/mnt"], check=True)
         assert reads(3) == 1

@@ -1,8 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
  * mappings [SHARED_KB] [--inherited] [--huge] [--segment] [--memfd] [--future] [--large]
- * [--unbound]: memory of every kind a plain fork does not carry as it is, and kinds that are easily forgotten.  Each
- * is written and read all the time.
+ * [--unbound]: memory of every kind a plain fork does not carry as it is, and kinds that are easily
+ * forgotten.  Each is written and read all the time.
  *
  * - anonymous, MADV_DONTFORK: not in a fork at all (V8 marks its heap so)
  * - anonymous, MADV_WIPEONFORK: zeroes in a fork
@@ -16,10 +16,10 @@
  * - areas with a memory policy, and with marks (MADV_HUGEPAGE and others)
  * - mappings that come and go all the time
  *
- * With --inherited the first two are ordinary memory; with --huge the shared memory is of
- * huge pages, with --segment System V's, with --memfd a memfd's; with --large there are 64 MB more of
- * shared memory that others can find in /dev/shm, of which nothing is expected; with --future all memory that comes is locked (mlockall); with --unbound no area
- * has a policy.
+ * With --inherited the first two are ordinary memory; with --huge the shared memory is of huge pages,
+ * with --segment System V's, with --memfd a memfd's; with --large there are 64 MB more of shared memory
+ * that others can find in /dev/shm, of which nothing is expected; with --future all memory that comes
+ * is locked (mlockall); with --unbound no area has a policy.
  */
 #include <linux/mempolicy.h>
 #include <setjmp.h>
