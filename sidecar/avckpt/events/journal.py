@@ -9,8 +9,6 @@ from avckpt.bucket import Bucket
 from avckpt.events.record import EventRecord
 from avckpt.events.vocabulary import EXPECTED, Kind, Reason
 
-log = logging.getLogger("avckpt")
-
 SELDOM_S = 60.0
 """Failures that may recur at every interval (a checkpoint, a health check) are logged at most this often per
 container."""
@@ -123,7 +121,7 @@ class Journal:
             return logging.WARNING, record.message
         return LEVELS[kind], record.message
 
-    def _checkpoint(self, record: EventRecord) -> tuple[int, str] | None:
+    def _checkpoint(self, record: EventRecord) -> tuple[int, str]:
         self._unprotected = ""
         lacking = str(record.error) if record.error is not None else ""
         new, self._lacking = lacking != self._lacking, lacking
@@ -133,8 +131,7 @@ class Journal:
         if not self._held:
             self._held = True
             return logging.INFO, f"protected: first {record.message.replace(':', ',', 1)}"
-        # Nearly all events are this, and hardly anybody wants to read them.
-        return (logging.DEBUG, record.message) if log.isEnabledFor(logging.DEBUG) else None
+        return logging.DEBUG, record.message
 
     def _lost(self, record: EventRecord) -> tuple[int, str] | None:
         # The guard retries every interval: log it once per reason.
