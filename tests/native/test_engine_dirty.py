@@ -13,7 +13,6 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -262,13 +261,18 @@ def test_the_same_one_is_restored_many_times(tmp_path: Path) -> None:
         victim.wait_beats(5)
 
 
+def change(victim: Victim, times: int) -> None:
+    """Makes it do once more what its counter 0 counts."""
+    os.kill(victim.app, signal.SIGUSR1)
+    wait_until(lambda: victim.see().counter[0] == times, PATIENCE_S, f"it has done so {times} times")
+
+
 def test_a_template_is_in_the_applications_landlock_domain(tmp_path: Path) -> None:
     """Which it has entered since the template was forked."""
     with Victim("fenced 40", tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
         for domains in range(1, 4):
             until_copied(guard)
-            os.kill(victim.app, signal.SIGUSR1)
-            wait_until(partial(lambda n: victim.see().counter[0] == n, domains), PATIENCE_S, "it is in that domain")
+            change(victim, domains)
             taken = checkpoint(guard)
             since = guard.mark()
             victim.kill_app()
@@ -283,8 +287,7 @@ def test_what_it_has_sealed_since_the_template_was_forked(tmp_path: Path) -> Non
     with Victim("sealer 40", tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
         for pages in range(1, 9):
             until_copied(guard)
-            os.kill(victim.app, signal.SIGUSR1)
-            wait_until(partial(lambda n: victim.see().counter[0] == n, pages), PATIENCE_S, "it has sealed one more")
+            change(victim, pages)
             checkpoint(guard)
             since = guard.mark()
             victim.kill_app()

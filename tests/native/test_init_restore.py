@@ -261,17 +261,24 @@ def test_guard_that_died_long_ago(init: Phoenix, guard: Guard) -> None:
     assert init.end() == 4
 
 
+@contextlib.contextmanager
+def stopped(init: Phoenix) -> Iterator[None]:
+    """Meanwhile it reads nothing."""
+    os.kill(init.pid, signal.SIGSTOP)
+    wait_until(lambda: state_of(init.pid) == "T", PATIENCE_S, "init's stop")
+    yield
+    os.kill(init.pid, signal.SIGCONT)
+
+
 def test_verdict_of_a_guard_that_died_counts(init: Phoenix, guard: Guard) -> None:
     pid = init.app_pid()
     init.app.say("die 11")
     guard.report()
     init.spawn(pid)
-    os.kill(init.pid, signal.SIGSTOP)
-    wait_until(lambda: state_of(init.pid) == "T", PATIENCE_S, "init's stop")
-    guard.answer(1, Verdict.RESTORED)
-    guard.die()
-    init.go()
-    os.kill(init.pid, signal.SIGCONT)
+    with stopped(init):
+        guard.answer(1, Verdict.RESTORED)
+        guard.die()
+        init.go()
     assert init.app_pid() == pid
     init.app.say("exit 4")
     assert init.end() == 4
@@ -341,11 +348,9 @@ def test_a_guard_is_not_late_for_what_init_is_late_to_tell() -> None:
         guard.answer(1, Verdict.WORKING)
         os.kill(pid, signal.SIGKILL)
         wait_until(lambda: state_of(pid) == "X", PATIENCE_S, "init has reaped it")
-        os.kill(init.pid, signal.SIGSTOP)
-        wait_until(lambda: state_of(init.pid) == "T", PATIENCE_S, "init's stop")
-        guard.answer(1, Verdict.RESTORED)
-        time.sleep(0.6)
-        os.kill(init.pid, signal.SIGCONT)
+        with stopped(init):
+            guard.answer(1, Verdict.RESTORED)
+            time.sleep(0.6)
         assert guard.report().seq == 2
         init.spawn(pid)
         guard.answer(2, Verdict.RESTORED)

@@ -524,9 +524,9 @@ static uint64_t own_bytes(const struct unkept_list *list)
 
 int memory_check_unkept(const struct image *image, uint32_t images, struct avc_error *err)
 {
-	const uint64_t limit = image->process->shm_bytes;
 	struct unkept_list list = { 0 };
 	const struct unkept *common;
+	uint64_t own;
 	bool added = true;
 	int result = 0;
 
@@ -545,12 +545,12 @@ int memory_check_unkept(const struct image *image, uint32_t images, struct avc_e
 				     "that is more than avckpt.shm allows",
 				     (unsigned long long)common->bytes / 1024);
 		/* 0: the user wants none to be rolled back. */
-		else if (limit && own_bytes(&list))
+		else if (image->process->shm_bytes && (own = own_bytes(&list)))
 			result = fail(err, AVC_UNSUPPORTED, 0, image->process->pid, "keep memory",
 				      "",
 				      "%llu kB of shared memory that nobody else has are more than "
 				      "avckpt.shm allows",
-				      (unsigned long long)own_bytes(&list) / 1024);
+				      (unsigned long long)own / 1024);
 	}
 	free(list.item);
 	return result;
