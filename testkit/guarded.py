@@ -376,6 +376,13 @@ def meanwhile(command: Sequence[str], count: int = 1) -> Iterator[None]:
             loop.wait()
 
 
+def are_all(tasks: Path, line: str) -> bool:
+    """Whether that line is in the status of all threads of /proc/PID/task."""
+    with contextlib.suppress(OSError):  # one ends just now
+        return all(line in (task / "status").read_text() for task in tasks.iterdir())
+    return False
+
+
 @contextlib.contextmanager
 def injected(whose: GuardProcess | Victim, calls: str, what: str, log: Path = Path("/dev/null")) -> Iterator[None]:
     """strace does something to these system calls of a guard, or of a victim's init: inject=... of strace(1).
@@ -384,7 +391,7 @@ def injected(whose: GuardProcess | Victim, calls: str, what: str, log: Path = Pa
     """
     if not shutil.which("strace"):
         pytest.skip("strace is what meddles with system calls; it is not installed")
-    status = Path(f"/proc/{whose.pid}/status")
+    tasks = Path(f"/proc/{whose.pid}/task")
     with subprocess.Popen(
         [
             *("strace", "-f", "-qq", "-o", str(log), "-e", f"trace={calls}"),
@@ -394,7 +401,7 @@ def injected(whose: GuardProcess | Victim, calls: str, what: str, log: Path = Pa
     ) as strace:
         try:
             traced = f"TracerPid:\t{strace.pid}\n"
-            wait_until(lambda: traced in status.read_text(), PATIENCE_S, "strace traces it", 0.001)
+            wait_until(lambda: are_all(tasks, traced), PATIENCE_S, "strace traces all its threads", 0.001)
             yield
         finally:
             strace.kill()
