@@ -14,6 +14,7 @@ from pathlib import Path
 import yaml
 from avckpt_hooks.shared.files import TooLong, read_bounded
 
+NULL = "tag:yaml.org,2002:null"
 _MERGE = "tag:yaml.org,2002:merge"
 _PLAIN = ("int", "float", "bool", "null")
 
@@ -160,6 +161,23 @@ def repeated(node: yaml.Node | None, seen: set[int] | None = None) -> Iterator[y
             if part[0].value in had:
                 yield part[0]
             had.add(part[0].value)
+
+
+def scalars(node: yaml.Node | None) -> Iterator[yaml.ScalarNode]:
+    """All keys and values in `node`, each once, however many aliases it has."""
+    seen: set[int] = set()
+    left = [] if node is None else [node]
+    while left:
+        one = left.pop()
+        if id(one) in seen:
+            continue
+        seen.add(id(one))
+        if isinstance(one, yaml.ScalarNode):
+            yield one
+        elif isinstance(one, yaml.MappingNode):
+            left += [each for pair in one.value for each in pair]
+        else:
+            left += one.value
 
 
 def lookup(node: yaml.Node | None, key: str) -> yaml.Node | None:

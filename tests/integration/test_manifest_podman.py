@@ -186,6 +186,20 @@ def test_a_name_that_another_container_has_is_a_failure(project: Project, podman
     assert "already in use" in done.stderr.splitlines()[-1]
 
 
+def test_what_another_manifest_of_the_project_started_stays(project: Project) -> None:
+    """They share pod and networks; without a word it looked as if these had been forgotten."""
+    plain = f"{{image: {BASE_IMAGE}, network_mode: host, stop_grace_period: 1s, command: sleep 100}}"
+    project.write(f"services: {{first: {plain}}}")
+    project.avckpt("up")
+    project.write(f"services: {{second: {plain}}}")
+    project.avckpt("up")
+    assert f"{project.name}_first_1: of another manifest" in project.avckpt("down").stderr
+    assert project.container("first").id in project.ids()
+    project.write(f"services: {{first: {plain}}}")
+    assert "manifest" not in project.avckpt("down").stderr
+    assert not project.ids()
+
+
 def test_files_that_nobody_names_are_those_of_podman_compose(
     project: Project, sidecar: Sidecar, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -202,13 +202,34 @@ def test_labels_elsewhere_are_not_the_containers(path: Path, where: str) -> None
         ("defaults: {}\n", "v.yaml:1: no services: is this a Compose file?"),
         ("", "v.yaml:1: no services: is this a Compose file?"),
         ("services: &s\n  a: {<<: *s, labels: &l {<<: *l}}\n", "v.yaml:1: an anchor that holds itself"),
-        ("services: {a: , b: 3, c: [1], d: {labels: }, 5: {labels: {1: 2}}}\n", ""),
+        ("services: {a: , d: {labels: }, 5: {labels: {1: 2}}}\n", ""),
+        ("services:\n  a: 3\n", "v.yaml:2: service a: a service is a mapping (image: ...): this is none"),
+        ("services: {a: [1]}\n", "v.yaml:1: service a: a service is a mapping (image: ...): this is none"),
     ],
 )
 def test_files_that_are_something_else(path: Path, text: str, problem: str) -> None:
     found = lines(checked(path, text))
     assert len(found) == (1 if problem else 0)
     assert "".join(found).startswith(problem)
+
+
+@pytest.mark.parametrize(
+    ("value", "problem"),
+    [
+        ("sleep ${X", "sleep ${X: no closing brace found for variable interpolation (a $ is written $$)"),
+        ("${1}", "${1}: invalid interpolation format: ${1}."),
+        ("${A:?must be set} ${B:-${C}} $D $$ $1 cost: 5$", ""),
+    ],
+)
+def test_values_that_podman_compose_cannot_read(path: Path, value: str, problem: str) -> None:
+    """Anywhere in a file; podman-compose 1.6 names neither file nor line.  Those that only lack a value can be read."""
+    for text in (
+        f"x-more: &more\n  - '{value}'\nservices:\n  a: {{command: *more, entrypoint: *more}}\n",
+        f"services:\n  a: {{image: '{value}'}}\n",
+    ):
+        found = lines(checked(path, text))
+        assert len(found) == (1 if problem else 0), found
+        assert "".join(found).startswith(f"v.yaml:2: {problem}" if problem else "")
 
 
 def avckpt(*args: object) -> tuple[int, str]:

@@ -24,7 +24,7 @@ class Fake(podman_compose.Compose):
     """Runs a shell script instead of podman-compose."""
 
     def __init__(self, script: str) -> None:
-        super().__init__([])
+        super().__init__([Path("v.yaml")])
         self._command = ["sh", "-c", script]
 
 
@@ -104,8 +104,25 @@ def test_what_the_hooks_refuse_is_told_in_their_words(tmp_path: Path) -> None:
 def test_a_question_that_fails_is_told_as_podman_composes() -> None:
     compose = podman_compose.Compose([Path("compose.yaml")])
     compose._command = [sys.executable, "-c", "raise SystemExit('ValueError: bad mount')", "podman_compose"]
-    with pytest.raises(AvckptError, match="^podman-compose ps failed: ValueError: bad mount$"):
+    with pytest.raises(AvckptError, match="^compose.yaml: podman-compose ps failed: bad mount$"):
         compose.containers()
+
+
+@pytest.mark.parametrize(
+    ("last", "told"),
+    [
+        ("RuntimeError: missing networks: n", "v.yaml w.yaml: podman-compose up failed: missing networks: n"),
+        ("TypeError: 'int' is no list", "v.yaml w.yaml: podman-compose up failed: TypeError: 'int' is no list"),
+        ("Error: no such image", "podman-compose up failed: Error: no such image"),
+    ],
+)
+def test_what_it_says_of_the_files_is_told_with_their_names(last: str, told: str) -> None:
+    """An exception of its own is about them; what Podman says is not."""
+    compose = podman_compose.Compose([Path("v.yaml"), Path("w.yaml")])
+    compose._command = [sys.executable, "-c", f"raise SystemExit({last!r})"]
+    with pytest.raises(AvckptError) as failure:
+        compose.up([], lambda line: None)
+    assert str(failure.value) == told
 
 
 def test_a_job_that_is_done_is_no_reason_for_a_failure(tmp_path: Path) -> None:
@@ -121,7 +138,7 @@ def test_a_job_that_is_done_is_no_reason_for_a_failure(tmp_path: Path) -> None:
 def test_a_traceback_is_its_last_line() -> None:
     said: list[str] = []
     program = "def f(): {}['a']\ntry:\n  f()\nexcept KeyError:\n  raise ValueError('no such thing')"
-    with pytest.raises(AvckptError, match="^podman-compose up failed: ValueError: no such thing$"):
+    with pytest.raises(AvckptError, match="^v.yaml: podman-compose up failed: no such thing$"):
         Fake(f'{sys.executable} -c "{program}"').up([], said.append)
     assert said == ["KeyError: 'a'", "ValueError: no such thing"]
 

@@ -146,8 +146,12 @@ def down(
     compose = Compose(paths, project, profiles=profiles, env_file=env_file)
     before = compose.containers() if as_json else []
     compose.down(services, volumes, _say)
+    staying = compose.containers()
+    if staying and not services:
+        names = ", ".join(sorted(one.name for one in staying))
+        _say(f"{names}: of another manifest of this project; stays, with the project's pod and networks")
     if as_json:
-        left = {one.id for one in compose.containers()}
+        left = {one.id for one in staying}
         gone = [{"service": one.service, "name": one.name, "id": one.id} for one in before if one.id not in left]
         click.echo(json.dumps(gone, indent=2))
 

@@ -11,10 +11,12 @@ from __future__ import annotations
 
 import enum
 import os
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import podman_compose
 import yaml
 from avckpt_hooks.shared.labels import LABELS, PREFIX, LabelError, meant_by, merge, parse_policy
 
@@ -44,6 +46,8 @@ COMPOSE_NAMES = (
 )
 """Without that, all of these that are there, later ones over earlier ones: so does podman-compose 1.6."""
 
+SHOWN_MOST = 60
+"""Characters of a value in a message."""
 EXTENDS_MOST = 50
 """Services that one extends, one by way of the other."""
 
@@ -267,6 +271,10 @@ class _Reader:
             return
         services = yamlfile.lookup(root, "services")
         for key, node in yamlfile.entries(services):
+            if not isinstance(node, yaml.MappingNode) and node.tag != yamlfile.NULL:
+                message = "a service is a mapping (image: ...): this is none"
+                self._complain(yamlfile.place_of(key, path), message, key.value)
+                continue
             service = self._service(key.value, yamlfile.place_of(key, path), node, path)
             self._add(service)
         include = yamlfile.lookup(root, "include")
@@ -398,6 +406,7 @@ class _Reader:
                 else:
                     self._complain(error.place, error.why)
             self._manifest.problems += repeated(self._roots[path], path)
+            self._manifest.problems += _unfinished(self._roots[path], path)
         return self._roots[path]
 
     def _complain(self, place: Place, message: str, service: str = "") -> None:
@@ -409,6 +418,24 @@ def repeated(document: yaml.Node | None, path: Path) -> Iterator[Problem]:
     for key in yamlfile.repeated(document):
         message = f"{key.value} is given twice: what was given first is lost"
         yield Problem(yamlfile.place_of(key, path), "", message, Severity.WARNING)
+
+
+class _AllSet(dict[str, str]):
+    """An environment with every variable: without it some values would only lack one."""
+
+    def get(self, name: str, default: object = None) -> str:
+        return name
+
+
+def _unfinished(document: yaml.Node | None, path: Path) -> Iterator[Problem]:
+    """Values that podman-compose takes for ${VARIABLES}, and cannot read.  It names neither file nor line."""
+    for node in yamlfile.scalars(document):
+        try:
+            podman_compose.var_interpolate(node.value, _AllSet())
+        except ValueError as error:
+            shown = textwrap.shorten(node.value, SHOWN_MOST, placeholder="...")
+            message = f"{shown}: {str(error)[:1].lower()}{str(error)[1:]} (a $ is written $$)"
+            yield Problem(yamlfile.place_of(node, path), "", message)
 
 
 def _extends(node: yaml.Node, path: Path) -> tuple[Path, str] | None:

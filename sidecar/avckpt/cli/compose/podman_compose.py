@@ -43,6 +43,8 @@ _NOT_THERE = ("Error: no container with name or ID", "Error: no pod with name or
 _OF_HOOKS = "avckpt: container "
 _HOOK_FAILED = "executing [avckpt-hook "
 _WARNING = re.compile(r'(?:time="[^"]*" )?(level=warning .*)')
+_EXCEPTION = re.compile(r"(?:ValueError|RuntimeError): |(?=\w+(?:Error|Exception): )")
+"""The first two have words for a user; others need their name."""
 _TRACEBACKS = ("Traceback (most recent call last):", "During handling of the above", "The above exception was")
 
 
@@ -70,6 +72,7 @@ class Compose:
     def __init__(
         self, files: Sequence[Path], project: str = "", *, profiles: Sequence[str] = (), env_file: Path | None = None
     ) -> None:
+        self._called = " ".join(map(str, files))
         self._command = [sys.executable, "-m", "podman_compose"]
         for path in files:
             self._command += ["-f", str(path)]
@@ -125,7 +128,7 @@ class Compose:
         if stuck:
             raise AvckptError(f"{command} was ended: it waited in vain for {', '.join(stuck)}")
         if process.returncode != 0:
-            raise AvckptError(f"{command} failed: {words.last or f'exit status {process.returncode}'}")
+            raise self._failed(command, words.last or f"exit status {process.returncode}")
         return words.error
 
     def _ask(self, command: list[str], *, lenient: bool = False) -> str:
@@ -135,8 +138,14 @@ class Compose:
             raise AvckptError(f"{_called(command)}: {error}") from error
         if done.returncode != 0 and not lenient:
             lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
-            raise AvckptError(f"{_called(command)} failed: {lines[-1]}")
+            raise self._failed(_called(command), lines[-1])
         return done.stdout
+
+    def _failed(self, command: str, why: str) -> AvckptError:
+        """An exception of its own is about the files, and it does not say which."""
+        exception = _EXCEPTION.match(why)
+        where = f"{self._called}: " if exception else ""
+        return AvckptError(f"{where}{command} failed: {why[exception.end() :] if exception else why}")
 
 
 def _called(command: Sequence[str]) -> str:

@@ -18,7 +18,6 @@ from avckpt.cli.compose.manifest import Kind, Manifest, Problem, Service, Settin
 from avckpt.yamlfile import Unreadable
 
 _STRING = "tag:yaml.org,2002:str"
-_NULL = "tag:yaml.org,2002:null"
 _TEMPLATES = (("template",), ("jobTemplate", "spec", "template"))
 """Where controllers have that of their pods, below `spec`."""
 
@@ -130,7 +129,7 @@ def _template(spec: yaml.Node | None) -> yaml.Node | None:
 
 def _settings(node: yaml.Node | None, path: Path, called: str, found: Manifest) -> Iterator[Setting]:
     """The `avckpt.*` entries of annotations or labels, without those that are none."""
-    if node is not None and not isinstance(node, yaml.MappingNode) and node.tag != _NULL:
+    if node is not None and not isinstance(node, yaml.MappingNode) and node.tag != yamlfile.NULL:
         message = 'annotations and labels are a mapping (avckpt.enable: "true"): these are none'
         found.problems.append(Problem(yamlfile.place_of(node, path), called, message))
     for key, value in yamlfile.entries(node):
