@@ -529,6 +529,8 @@ class Daemon:
                 continue  # the last events of a guard that has been stopped
             container = watch.container
             at = time.time() - (time.monotonic_ns() - event.at_ns) / 1e9
+            if event.kind is Kind.MISSED and self.caretaker.is_paused(watch):
+                event = dataclasses.replace(event, error=Paused("it is paused (podman unpause)"))
             container.apply(event, at)
             if event.kind is Kind.ENDED:
                 # The end of the container is reported once it is known.

@@ -127,6 +127,18 @@ def test_pause_and_unpause(sidecar: Sidecar, container: ContainerFactory, tmp_pa
     assert victim.kill(signal.SIGKILL)["state"] == "protected"
 
 
+def test_a_checkpoint_missed_for_a_pause_says_so(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
+    """And not that some thread did not stop in time."""
+    made = start_victim(sidecar, container, tmp_path, "threads 4 1").container
+    made.podman.run("pause", made.name)
+    try:
+        told = "checkpoint missed: it is paused (podman unpause)"
+        sidecar.wait_for(made, lambda entry: entry["reason"] == told, "it is told why")
+    finally:
+        made.podman.run("unpause", made.name)
+    sidecar.wait_for(made, lambda entry: entry["reason"] == "", "the next checkpoint")
+
+
 def test_killed_while_paused(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
     """It dies when it is unpaused, and is restored then."""
     victim = start_victim(sidecar, container, tmp_path, "threads 4 1")

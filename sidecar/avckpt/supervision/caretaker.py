@@ -105,6 +105,11 @@ class Caretaker(Generic[W]):
             care.oom_group.give_back()
             care.oom_group = None
 
+    def is_paused(self, ward: W) -> bool:
+        """Whether its container is (podman pause)."""
+        care = self._cares.get(ward.container.cookie)
+        return care is not None and care.groups.is_frozen()
+
     async def close(self) -> None:
         """Ends everything that is under way."""
         tasks = [care.health for care in self._cares.values() if care.health is not None]
