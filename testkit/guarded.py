@@ -173,7 +173,17 @@ class GuardProcess:
                         return self.events[at - 1]
                 left = deadline - time.monotonic()
                 if left <= 0 or self._ended or not self._news.wait(left):
-                    raise AssertionError(f"no {what}; but {self.events[since:][-12:]}")
+                    raise AssertionError(
+                        f"no {what}; but {self.events[since:][-12:]}, after {self.events[:since][-8:]}"
+                    )
+
+    def wait_held(self, cookie: int = 1) -> None:
+        """Until it holds a generation.  A restore that gets no CPU to make another template uses its own up."""
+        with self._news:
+            since = len(self.events)
+            last = next(event for event in reversed(self.events) if event.get("cookie") == cookie)
+        if not last.get("generations"):
+            self.wait("checkpoint", since=since, cookie=cookie)
 
     def command(self, name: str, cookie: int = 1, timeout_s: float = PATIENCE_S) -> Json:
         """`checkpoint` or `restore`, once init was found; returns the answer."""
@@ -350,6 +360,7 @@ def kill_at_random(
     pid, acting = inside(victim.app), victim.see().pid
     for _ in range(kills):
         time.sleep(rng.uniform(*pause_s))
+        guard.wait_held(cookie)
         since = guard.mark()
         victim.kill_app()
         guard.wait("restored", since=since, cookie=cookie)
