@@ -30,7 +30,7 @@ def write(victim: Victim) -> None:
     wait_until(lambda: victim.see().counter[0] > done, 10, "it has written")
 
 
-@pytest.mark.parametrize("how", ["append", "output", "recording", "rotate", "read", "status", "replace"])
+@pytest.mark.parametrize("how", ["append", "output", "recording", "rotate", "read", "status", "replace", "pulse"])
 def test_goes_back_beside_files_that_are_only_written_on(how: str, tmp_path: Path) -> None:
     with (
         Victim(f"ledger {how} {tmp_path}", tmp_path) as victim,

@@ -7,6 +7,7 @@
  */
 #include <signal.h>
 #include <sys/file.h>
+#include <sys/stat.h>
 #include <sys/wait.h>
 
 #include "victim.h"
@@ -66,6 +67,18 @@ static void recording(void)
 {
 	fd = make("data", 0, O_RDWR);
 	must(write(fd, text, 100) == 100, "write");
+}
+
+/* As a worker of gunicorn: its master looks at the time of a file that has no name. */
+static void pulse(void)
+{
+	fd = make("data", 0, O_RDWR);
+	unlink(path_of("data"));
+}
+
+static void touch(void)
+{
+	must(futimens(fd, NULL) == 0, "futimens");
 }
 
 static void database(void)
@@ -211,23 +224,15 @@ static const struct way {
 	const char *name;
 	void (*setup)(void), (*write)(void);
 } ways[] = {
-	{ "append", appended, write_on },
-	{ "output", output, write_on },
-	{ "recording", recording, write_on },
-	{ "rotate", appended, rotate },
-	{ "read", database, read_back },
-	{ "status", map_small, write_mapping },
-	{ "replace", config_file, replace },
-	{ "in-place", database, write_in_place },
-	{ "extend", database, extend },
-	{ "close", database, write_and_close },
-	{ "at-end", database_at_its_end, write_in_place },
-	{ "locked", locked, write_in_place },
-	{ "mapped", map_big, write_mapping },
-	{ "temporary", output, delete },
-	{ "scratch", scratch, close_it },
-	{ "worker", worker, ask_worker },
-	{ "named", map_named, unlink_it },
+	{ "append", appended, write_on },         { "output", output, write_on },
+	{ "recording", recording, write_on },     { "rotate", appended, rotate },
+	{ "read", database, read_back },          { "status", map_small, write_mapping },
+	{ "replace", config_file, replace },      { "pulse", pulse, touch },
+	{ "in-place", database, write_in_place }, { "extend", database, extend },
+	{ "close", database, write_and_close },   { "at-end", database_at_its_end, write_in_place },
+	{ "locked", locked, write_in_place },     { "mapped", map_big, write_mapping },
+	{ "temporary", output, delete },          { "scratch", scratch, close_it },
+	{ "worker", worker, ask_worker },         { "named", map_named, unlink_it },
 };
 
 int main(int argc, char **argv)

@@ -75,6 +75,9 @@ static bool is_in_the_way(const struct image *image, const struct file *w, const
 
 	if (w->flags & O_APPEND || (output && !w->lock_count))
 		return false;
+	/* Nothing is in it, then and now: only its times were set, as a sign of life (gunicorn). */
+	if (!w->bytes && !st->st_size)
+		return false;
 	if (!changed)
 		return w->bytes > STATUS_BYTES && modified + DIRTY_NS > image->files->taken_ns &&
 		       is_mapped(image->template, w);
