@@ -405,7 +405,7 @@ def test_a_watched_file_that_is_gone_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.shared_machine("once the PID was taken for seconds on a busy one, nobody knows by whom: the message tells")
 @pytest.mark.parametrize("where", WHERE)
-@pytest.mark.parametrize("scenario", ["messages", "flight", "shut", "user", "pidfds", "child", "full"])
+@pytest.mark.parametrize("scenario", ["messages", "flight", "taken", "shut", "user", "pidfds", "child", "full"])
 def test_sockets(scenario: str, where: str, tmp_path: Path) -> None:
     """Datagrams and records are queued again with their boundaries; a pidfd refers to the same process; a peer is of
     the user that it was, and not of the guard's."""

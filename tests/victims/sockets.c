@@ -5,6 +5,7 @@
  *   sockets SCENARIO FOLDER     see scenario.h
  */
 #include <grp.h>
+#include <netinet/in.h>
 #include <poll.h>
 #include <sys/epoll.h>
 #include <sys/resource.h>
@@ -70,31 +71,6 @@ static void messages_verify(void)
 	CHECK(getsockopt(fd[1], SOL_SOCKET, SO_PEEK_OFF, &offset, &bytes) == 0 && offset == -1,
 	      "SO_PEEK_OFF is %d", offset);
 	say_all();
-}
-
-/* ---- descriptors in flight: lost, and told ----------------------------------------- */
-
-static void rights_setup(void)
-{
-	char byte = 'x', control[CMSG_SPACE(sizeof(int))] = { 0 };
-	struct iovec io = { &byte, 1 };
-	struct msghdr head = { .msg_iov = &io,
-			       .msg_iovlen = 1,
-			       .msg_control = control,
-			       .msg_controllen = sizeof control };
-	struct cmsghdr *c = CMSG_FIRSTHDR(&head);
-
-	must(socketpair(AF_UNIX, SOCK_STREAM, 0, fd) == 0, "socketpair");
-	c->cmsg_level = SOL_SOCKET;
-	c->cmsg_type = SCM_RIGHTS;
-	c->cmsg_len = CMSG_LEN(sizeof(int));
-	memcpy(CMSG_DATA(c), &fd[0], sizeof(int));
-	must(sendmsg(fd[0], &head, 0) == 1, "sendmsg");
-}
-
-static void rights_disturb(void)
-{
-	must(read(fd[1], scratch, 1) == 1, "read");
 }
 
 /* ---- descriptors in flight that stay there -------------------------------------------- */
@@ -206,6 +182,102 @@ static void flight_verify(void)
 	CHECK(sender.pid == getpid(), "it came from %d", sender.pid);
 	close(file);
 	send_flight(out, in, inner);
+}
+
+/* ---- descriptors in flight that are taken, and used up: as a server's that gives its connections to
+ * workers ---- */
+
+/* A connection that nobody else has, as given away. */
+static int connection(void)
+{
+	struct sockaddr_in here = { .sin_family = AF_INET,
+				    .sin_addr.s_addr = htonl(INADDR_LOOPBACK) };
+	socklen_t bytes = sizeof here;
+	const int l = socket(AF_INET, SOCK_STREAM, 0), client = socket(AF_INET, SOCK_STREAM, 0);
+	int accepted;
+
+	must(!bind(l, (void *)&here, sizeof here) && !listen(l, 1) &&
+		     !getsockname(l, (void *)&here, &bytes) &&
+		     !connect(client, (void *)&here, bytes),
+	     "connect");
+	accepted = accept(l, NULL, NULL);
+	must(accepted >= 0, "accept");
+	close(l);
+	close(client);
+	return accepted;
+}
+
+static void send_all(void)
+{
+	const int given = connection();
+
+	say(fd[0], "nothing, ");
+	give(fd[0], "a connection", given);
+	give(fd[0], "a file", fd[10]);
+	say(fd[0], " and the end");
+	give(fd[2], "a pipe", fd[5]);
+	say(fd[2], "a record without");
+	give(fd[2], "itself", fd[3]);
+	close(given);
+}
+
+static void taken_setup(void)
+{
+	int ends[2];
+
+	must(socketpair(AF_UNIX, SOCK_STREAM, 0, fd) == 0 &&
+		     socketpair(AF_UNIX, SOCK_SEQPACKET, 0, fd + 2) == 0 && pipe(ends) == 0,
+	     "socketpair");
+	fd[4] = ends[0];
+	fd[5] = ends[1];
+	fd[10] = open("/etc/passwd", O_RDONLY);
+	send_all();
+}
+
+static void taken_take(void)
+{
+	const int given = take(fd[1], "nothing, a connection"), file = take(fd[1], "a file"),
+		  none = take(fd[1], " and the end"), in = take(fd[3], "a pipe");
+	int other;
+
+	CHECK(given >= 0 && recv(given, scratch, 1, MSG_DONTWAIT) == 0,
+	      "descriptor %d is no connection that has ended", given);
+	CHECK(is_passwd(file), "descriptor %d is another file", file);
+	CHECK(none < 0, "a descriptor with the last bytes");
+	CHECK(in >= 0 && write(in, "through it", 10) == 10, "descriptor %d is no pipe", in);
+	expect_text(fd[4], "through it", "the pipe whose end was given");
+	CHECK(take(fd[3], "a record without") < 0, "a descriptor with a record without one");
+	other = take(fd[3], "itself");
+	CHECK(syscall(SYS_kcmp, getpid(), getpid(), 0, other, fd[3]) == 0,
+	      "descriptor %d is another socket", other);
+	close(given);
+	close(file);
+	close(in);
+	close(other);
+}
+
+/* Its next life takes them again. */
+static void taken_verify(void)
+{
+	taken_take();
+	send_all();
+}
+
+/* ---- descriptors in flight that nobody has any more: lost, and told --------------------------------- */
+
+static void rights_setup(void)
+{
+	int ends[2];
+
+	must(socketpair(AF_UNIX, SOCK_STREAM, 0, fd) == 0 && pipe(ends) == 0, "socketpair");
+	give(fd[0], "x", ends[0]);
+	close(ends[0]);
+	close(ends[1]);
+}
+
+static void rights_disturb(void)
+{
+	must(read(fd[1], scratch, 1) == 1, "read");
 }
 
 /* ---- ends that are shut ------------------------------------------------------------------ */
@@ -502,6 +574,7 @@ static const struct scenario scenarios[] = {
 	{ "pidfds", pidfds_setup, pidfds_disturb, pidfds_verify },
 	{ "full", full_setup, nothing, full_verify },
 	{ "rights", rights_setup, rights_disturb, nothing },
+	{ "taken", taken_setup, taken_take, taken_verify },
 	{ "flight", flight_setup, nothing, flight_verify },
 	{ "shut", shut_setup, shut_disturb, shut_verify },
 	{ "user", user_setup, user_disturb, user_verify },

@@ -67,6 +67,7 @@ void files_free(struct files *files)
 		free(f->lock);
 		file_socket_free(f->socket);
 		free(f->content);
+		free(f->flight);
 	}
 	files_free(files->heirs);
 	free(files->varied);

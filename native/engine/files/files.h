@@ -248,6 +248,15 @@ struct file_rights {
 	uint32_t groups[RIGHTS_GROUPS];
 };
 
+/* A descriptor in flight (SCM_RIGHTS). */
+struct file_flight {
+	uint32_t at, end; /* in the contents: what it came with; 0: to the end       */
+	uint64_t dev, ino;
+	uint32_t mode;
+	int flags;                  /* F_GETFL                                   */
+	int domain, type, protocol; /* of a socket                             */
+};
+
 struct file {
 	int fd;
 	enum file_kind kind;
@@ -313,6 +322,9 @@ struct file {
 	bool rights_lost;  /* descriptors in flight (SCM_RIGHTS)                     */
 	bool senders_lost; /* readers see the sender (SCM_CREDENTIALS) */
 	uint64_t rights;   /* a hash of these, as far as known; 0: none */
+	/* Those, allocated */
+	struct file_flight *flight;
+	uint32_t flight_count;
 	struct file_video video;
 	/* The same open file description in `parent` of files_look(); NULL: not known to be.
 	 * Afterwards only in the images of a freeze, where all are at the same time. */
@@ -468,10 +480,12 @@ const char *file_put_state(int fd, const struct file *want, const struct file *n
 /* Reads what is in it; a pipe has to be O_NONBLOCK.  False if it does not become empty: a process outside
  * of the application keeps writing. */
 bool file_drain(int fd, bool pipe);
-/* As send(2).  The kernel tells readers who has sent it (SO_PASSCRED, unix(7)): that is not known any
- * more, but it was not us. */
-ssize_t file_send_as_nobody(int fd, const void *data, size_t bytes);
-const char *file_put_content(int fd, int other_fd, const struct file *want);
+/* As send(2), with `count` descriptors.  The kernel tells readers who has sent it (SO_PASSCRED,
+ * unix(7)): that is not known any more, but it was not us. */
+ssize_t file_send_as_nobody(int fd, const void *data, size_t bytes, const int *passed,
+			    uint32_t count);
+/* `passed`: descriptors of ours for want->flight, -1: lost; NULL: all are. */
+const char *file_put_content(int fd, int other_fd, const struct file *want, const int *passed);
 bool file_tcp_moved(const struct file *want, const struct file *now);
 const char *file_reset_tcp(int fd);
 

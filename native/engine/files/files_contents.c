@@ -40,7 +40,7 @@ void file_copy_content(const struct files *parent, struct file *f)
 
 	f->ended = from->ended;
 	f->content_lost = from->content_lost;
-	f->rights_lost = from->rights_lost;
+	f->rights_lost = from->rights_lost || from->flight_count;
 	f->senders_lost = from->senders_lost;
 	f->rights = from->rights;
 	/* What is restored once is kept in one of them (files_family.c). */

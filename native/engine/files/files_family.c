@@ -5,11 +5,13 @@
  * restored once.
  */
 #include <fcntl.h>
+#include <netinet/in.h>
 #include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/ioctl.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 #include "files.h"
@@ -399,6 +401,50 @@ static bool has_ended(const struct tables *tables, const struct file *w)
 	return w->ended || (tables->work[0].want->several && !w->outside);
 }
 
+/* What was in flight, as somebody has it (what is no file, pipe or socket cannot be told from others of
+ * its kind); -1: nobody has. */
+static int find_flight(const struct tables *tables, const struct file_flight *flight)
+{
+	const mode_t kind = flight->mode & S_IFMT;
+	int fd;
+
+	for (uint32_t i = 0; kind && i < tables->count; i++)
+		for (uint32_t k = 0; k < tables->work[i].want->count; k++) {
+			const struct spot at = { 0, i, k };
+			const struct file *w = file_at(tables, &at);
+
+			(void)budget_step();
+			if (w->ino == flight->ino && w->dev == flight->dev &&
+			    (w->mode & S_IFMT) == kind &&
+			    !((w->flags ^ flight->flags) & O_ACCMODE) && borrow(tables, &at, &fd))
+				return fd;
+		}
+	return -1;
+}
+
+/* A connection that nobody has any more reads as closed, as that of a descriptor does (files_make.c).
+ * Allocated; NULL: none. */
+static int *find_flights(const struct tables *tables, const struct files_work *work,
+			 const struct file *content)
+{
+	int *passed = content->flight_count ? calloc(content->flight_count, sizeof *passed) : NULL;
+
+	for (uint32_t i = 0; passed && i < content->flight_count; i++) {
+		const struct file_flight *flight = &content->flight[i];
+		struct file_socket socket = { .domain = flight->domain,
+					      .type = flight->type,
+					      .protocol = flight->protocol };
+		const struct file dead = { .kind = FILE_SOCKET, .socket = &socket };
+		const char *why;
+
+		passed[i] = find_flight(tables, flight);
+		if (passed[i] < 0 && socket.protocol == IPPROTO_TCP)
+			passed[i] = file_make(&dead, work->image->template, work->init,
+					      &work->want->rights, &why);
+	}
+	return passed;
+}
+
 static void put_contents(const struct tables *tables)
 {
 	for (uint32_t i = 0; i < tables->count; i++) {
@@ -421,8 +467,15 @@ static void put_contents(const struct tables *tables)
 				found = true;
 			}
 			if (found && (content->content_bytes || content->content_lost ||
-				      (ioctl(fd, FIONREAD, &bytes) == 0 && bytes)))
-				files_note(work, w, file_put_content(fd, other_fd, content));
+				      (ioctl(fd, FIONREAD, &bytes) == 0 && bytes))) {
+				int *passed = find_flights(tables, work, content);
+
+				files_note(work, w,
+					   file_put_content(fd, other_fd, content, passed));
+				for (uint32_t n = 0; passed && n < content->flight_count; n++)
+					close_fd(&passed[n]);
+				free(passed);
+			}
 			close_fd(&fd);
 			close_fd(&other_fd);
 		}

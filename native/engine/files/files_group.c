@@ -527,7 +527,7 @@ static enum mend_state mend(struct group_end *end, const struct avc_end *other,
 	}
 	if (end->sent < bytes) {
 		n = file_send_as_nobody(end->fd, board->content + other->at + end->sent,
-					bytes - end->sent);
+					bytes - end->sent, NULL, 0);
 		if (n > 0)
 			end->sent += (uint32_t)n;
 		else if (!is_stream(end->file))

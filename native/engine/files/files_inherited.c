@@ -29,7 +29,8 @@ static void copy_of(struct file *f, const struct file *is)
 	f->mark = NULL;
 	f->lock = NULL;
 	f->content = NULL;
-	f->watch_count = f->mark_count = f->lock_count = f->content_bytes = 0;
+	f->flight = NULL;
+	f->watch_count = f->mark_count = f->lock_count = f->content_bytes = f->flight_count = 0;
 	f->ours = 0;
 	f->shared = is->fd;
 	f->family = NULL;

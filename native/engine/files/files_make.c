@@ -182,7 +182,7 @@ static int socket_of(pid_t template, int domain, int type, int protocol)
 static void leave_content(int fd, int other_fd, const struct file *want)
 {
 	if (want->ended && want->content)
-		(void)file_put_content(fd, other_fd, want);
+		(void)file_put_content(fd, other_fd, want, NULL);
 }
 
 /* A socket or pipe that reads as closed by the peer, after its contents. */

@@ -12,6 +12,7 @@
 #include <sys/ioctl.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
+#include <sys/sysmacros.h>
 #include <sys/uio.h>
 #include <unistd.h>
 
@@ -78,12 +79,39 @@ void files_land(void)
 		free(job);
 }
 
+/* One more, or none if there is no memory: then it is lost. */
+static void note_flight(int fd, const struct statx *st, struct file *file)
+{
+	struct file_flight *more = realloc(file->flight,
+					   (file->flight_count + 1) * sizeof *file->flight);
+
+	file->rights_lost |= !more;
+	if (!more)
+		return;
+	file->flight = more;
+	more[file->flight_count] = (struct file_flight){
+		.at = file->content_bytes,
+		.dev = makedev(st->stx_dev_major, st->stx_dev_minor),
+		.ino = st->stx_ino,
+		.mode = st->stx_mode,
+		.flags = fcntl(fd, F_GETFL),
+	};
+	if (S_ISSOCK(st->stx_mode)) {
+		more[file->flight_count].domain = file_option(fd, SOL_SOCKET, SO_DOMAIN);
+		more[file->flight_count].type = file_option(fd, SOL_SOCKET, SO_TYPE);
+		more[file->flight_count].protocol = file_option(fd, SOL_SOCKET, SO_PROTOCOL);
+	}
+	file->flight_count++;
+}
+
 /* Not in a freeze: it may block. */
-static uint64_t mark_of(int fd)
+static uint64_t mark_of(int fd, struct file *file)
 {
 	struct statx st = { 0 };
+	const bool known = fd_look(fd, STATX_TYPE | STATX_INO, &st);
 
-	if (!fd_look(fd, STATX_TYPE | STATX_INO, &st))
+	note_flight(fd, &st, file);
+	if (!known)
 		return RIGHTS_UNKNOWN;
 	return st.stx_ino * 31 + st.stx_dev_minor * 7919 + st.stx_dev_major +
 	       ((uint64_t)st.stx_mode << 48) + ((uint64_t)st.stx_rdev_minor << 32);
@@ -99,9 +127,8 @@ static void land(const struct cmsghdr *c, bool rights, struct file *file)
 		memcpy(&fd, CMSG_DATA(c) + i * sizeof fd, sizeof fd);
 		landing->fd[landing->count++] = fd;
 		if (rights)
-			file->rights = file->rights * 1099511628211u + mark_of(fd) + 1;
+			file->rights = file->rights * 1099511628211u + mark_of(fd, file) + 1;
 	}
-	file->rights_lost |= rights;
 }
 
 static void hear_control(struct msghdr *head, struct file *file)
@@ -158,6 +185,7 @@ static void look_through(int fd, struct file *file)
 
 		if (more)
 			file->content = more;
+		file->content_bytes = (uint32_t)used; /* where what comes along belongs */
 		n = more ? peek(fd, file, more + used + length, MESSAGE_MAX) : MESSAGE_MAX + 1;
 		/* The peek offset cannot move past an empty datagram; on other sockets it is the
 		 * end. */
@@ -171,6 +199,9 @@ static void look_through(int fd, struct file *file)
 		(void)budget_take(bytes);
 		memcpy(file->content + used, &bytes, length);
 		used += length + bytes;
+		for (uint32_t i = file->flight_count;
+		     i && file->flight[i - 1].at == file->content_bytes; i--)
+			file->flight[i - 1].end = (uint32_t)used;
 	}
 	file->content_bytes = (uint32_t)used;
 }
@@ -226,7 +257,7 @@ void file_keep_messages(struct process *process, int fd, struct file *file, uint
 	if (n == bytes)
 		return;
 	/* A peek ends at a descriptor in flight. */
-	file->rights = 0;
+	file->rights = file->flight_count = 0;
 	look_again(process, fd, file);
 	file->content_lost |= file->content_bytes != bytes;
 }
@@ -246,6 +277,7 @@ bool file_has_messages(int fd, const struct file *want)
 	same = !is.content_lost && is.content_bytes == want->content_bytes &&
 	       is.rights == want->rights && !memcmp(is.content, want->content, is.content_bytes);
 	free(is.content);
+	free(is.flight);
 	return same;
 }
 

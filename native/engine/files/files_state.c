@@ -464,26 +464,71 @@ bool file_drain(int fd, bool pipe)
 	return n <= 0;
 }
 
-ssize_t file_send_as_nobody(int fd, const void *data, size_t bytes)
+#define PASSED_MAX 253 /* SCM_MAX_FD (include/net/scm.h) */
+
+ssize_t file_send_as_nobody(int fd, const void *data, size_t bytes, const int *passed,
+			    uint32_t count)
 {
+	const size_t senders = CMSG_SPACE(sizeof(struct ucred));
 	union {
-		char bytes[CMSG_SPACE(sizeof(struct ucred))];
+		char bytes[CMSG_SPACE(sizeof(struct ucred)) + CMSG_SPACE(PASSED_MAX * sizeof(int))];
 		struct cmsghdr head;
 	} control = { .head = { .cmsg_len = CMSG_LEN(sizeof(struct ucred)),
 				.cmsg_level = SOL_SOCKET,
 				.cmsg_type = SCM_CREDENTIALS } };
+	struct cmsghdr *rights = (void *)(control.bytes + senders);
 	const struct ucred nobody = { getpid(), OVERFLOW_ID, OVERFLOW_ID };
 	struct iovec io = { (void *)data, bytes };
-	const struct msghdr head = { .msg_iov = &io,
-				     .msg_iovlen = 1,
-				     .msg_control = &control,
-				     .msg_controllen = sizeof control };
+	const struct msghdr head = {
+		.msg_iov = &io,
+		.msg_iovlen = 1,
+		.msg_control = &control,
+		.msg_controllen = senders + (count ? CMSG_SPACE(count * sizeof(int)) : 0)
+	};
 
 	memcpy(CMSG_DATA(&control.head), &nobody, sizeof nobody);
+	if (count) {
+		*rights = (struct cmsghdr){ .cmsg_len = CMSG_LEN(count * sizeof(int)),
+					    .cmsg_level = SOL_SOCKET,
+					    .cmsg_type = SCM_RIGHTS };
+		memcpy(CMSG_DATA(rights), passed, count * sizeof(int));
+	}
 	return sendmsg(fd, &head, MSG_DONTWAIT | MSG_NOSIGNAL);
 }
 
-const char *file_put_content(int fd, int other_fd, const struct file *want)
+/* One message, or the bytes of a stream that go with descriptors in flight, and those to them. */
+static ssize_t put_message(int out, const struct file *want, uint32_t at, const int *passed)
+{
+	const bool stream = want->socket->type == SOCK_STREAM;
+	const uint8_t *from = want->content + at;
+	uint32_t bytes = want->content_bytes - at, count = 0;
+	int with[PASSED_MAX];
+
+	for (uint32_t i = 0; i < want->flight_count; i++) {
+		const struct file_flight *f = &want->flight[i];
+		const uint32_t edge = f->at > at ? f->at : f->end;
+
+		if (edge > at && edge - at < bytes)
+			bytes = edge - at;
+		if (f->at == at && passed && passed[i] >= 0 && count < PASSED_MAX)
+			with[count++] = passed[i];
+	}
+	if (!stream) {
+		memcpy(&bytes, from, sizeof bytes);
+		from += sizeof bytes;
+	}
+	return file_send_as_nobody(out, from, bytes, with, count);
+}
+
+static bool all_passed(const struct file *want, const int *passed)
+{
+	for (uint32_t i = 0; i < want->flight_count; i++)
+		if (!passed || passed[i] < 0)
+			return false;
+	return !want->rights_lost;
+}
+
+const char *file_put_content(int fd, int other_fd, const struct file *want, const int *passed)
 {
 	const bool pipe = want->kind == FILE_PIPE,
 		   messages = !pipe && want->socket->type != SOCK_STREAM;
@@ -500,25 +545,18 @@ const char *file_put_content(int fd, int other_fd, const struct file *want)
 	emptied = in >= 0 && out >= 0 && file_drain(in, pipe);
 	if (emptied) {
 		while (put < want->content_bytes) {
-			const uint8_t *from = want->content + put;
-			uint32_t bytes = want->content_bytes - put;
-			ssize_t n;
-
-			if (messages) {
-				memcpy(&bytes, from, sizeof bytes);
-				from += sizeof bytes;
-				put += sizeof bytes;
-			}
-			n = pipe ? write(out, from, bytes) : file_send_as_nobody(out, from, bytes);
+			const ssize_t n = pipe ? write(out, want->content + put,
+						       want->content_bytes - put)
+					       : put_message(out, want, put, passed);
 
 			if (n <= 0)
 				break;
-			put += (uint32_t)n;
+			put += (uint32_t)n + (messages ? (uint32_t)sizeof(uint32_t) : 0);
 		}
 	}
 	if (put < want->content_bytes || !emptied)
 		problem = "its contents could not be put back";
-	else if (want->rights_lost)
+	else if (!all_passed(want, passed))
 		problem = "descriptors in flight in it are lost";
 	else if (want->content_lost)
 		problem = "its contents are lost";
