@@ -32,7 +32,7 @@
 
 /* For the answer of the engine's helper, which is fast when it has a CPU. */
 #define ASK_SPINS 2000
-#define ASK_SLEEPS 200
+#define ASK_SLEEPS 500 /* as long as a step of a restore */
 #define ASK_SLEEP_MS 10
 
 struct inj_timespec {

@@ -38,7 +38,8 @@
 
 /* Default time for which code without a tracer waits for one before it returns by itself. */
 #define INJ_PARK_MS 100
-#define INJ_GO_S 10
+/* Longer than a restore with all its attempts (restore_patience()). */
+#define INJ_GO_S 60
 
 struct inj_syscall {
 	int64_t nr;

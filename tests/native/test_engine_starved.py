@@ -15,11 +15,11 @@ from typing import Any
 
 import pytest
 
-from testkit.cgroups import throttle
+from testkit.cgroups import freezer, throttle
 from testkit.family import kill_main
 from testkit.guarded import PATIENCE_S, WHERE, GuardProcess, Victim, config
 from testkit.harness import wait_until
-from testkit.procfs import children_of, status_of
+from testkit.procfs import children_of, comm_of, status_of
 
 pytestmark = [
     pytest.mark.alone("it takes a CPU away from everybody else"),
@@ -32,6 +32,9 @@ SOME = 3
 """The same where the others of its process run."""
 GUARDS = 60
 """Each is killed while a thread may be on its way home."""
+
+LATE_S = 1.5
+"""Longer than a checkpoint waits for a template, and than a restore used to."""
 
 IN_STUB = 3
 """Threads that have not left the first injected instructions in time."""
@@ -232,6 +235,36 @@ def test_restored_while_starved(cpus: tuple[int, int], tmp_path: Path) -> None:
                 victim.kill_app()
                 restored = guard.wait("restored", since=since)
                 assert restored["generation"] == 2, (n, restored)
+        victim.wait_beats(20)
+
+
+@pytest.mark.parametrize("command", ["threads 6 1", "tree 8"])
+@pytest.mark.parametrize("late_guard", [False, True])
+def test_restored_by_and_by(late_guard: bool, command: str, tmp_path: Path) -> None:
+    """Each step comes later than a checkpoint would wait for it, and than init waits for a guard that says nothing."""
+    options = () if late_guard else ("--wait-ms", f"{LATE_S * 600:.0f}")
+    with (
+        freezer(1) as late,
+        Victim(command, tmp_path, options=options) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        taken = guard.checkpoint()
+        for pid in children_of(victim.pid):
+            if comm_of(pid).startswith("avckpt-"):
+                late.take(pid)  # what is forked from it will be there, too
+        if late_guard:
+            late.take(guard.pid)
+        late.wait()
+        kill_main(victim)
+        ends: list[dict[str, Any]] = []
+        while not ends:
+            time.sleep(LATE_S)
+            late.go()
+            time.sleep(0.005)
+            late.wait()
+            ends = [event for event in guard.events if event["kind"] in ("restored", "gave_up", "ended")]
+        late.go()
+        assert (ends[0]["kind"], ends[0].get("generation")) == ("restored", taken["generation"]), ends
         victim.wait_beats(20)
 
 

@@ -109,8 +109,20 @@ bool budget_has(uint64_t bytes);
 bool budget_take(uint64_t bytes);
 /* Progress. False when the budget is exceeded. */
 bool budget_step(void);
+/* To be called in each wait for somebody else, which is work, too.  False: it is in vain. */
+bool budget_wait(void);
 /* -1 with that code and the reason as text when it is exceeded. */
 int budget_check(pid_t pid, struct avc_error *err) warn_unused;
+
+/* Between the two nothing of the application is alive that waiting could harm.  So whoever gets no CPU
+ * is waited for, and a generation is not given up because a step of its restore is late.  `until_ns`:
+ * when a restore would come too late, CLOCK_MONOTONIC; 0: never. */
+void restore_patience_begin(uint64_t until_ns);
+void restore_patience_end(void);
+/* The container has ended meanwhile: all waits end at once. */
+void restore_is_in_vain(void);
+/* How long to wait for a step that is otherwise given so long: the same in a checkpoint. */
+uint64_t restore_patience(uint64_t ns);
 
 /* ---- aside.c ---------------------------------------------------------------- */
 
@@ -222,6 +234,8 @@ bool proc_is_killed(pid_t pid);
 /* Whether a signal is killing it, by an open /proc/PID/stat; the kernel may be writing its core. */
 bool proc_is_dying(int stat_fd);
 bool pidfd_ended(int pidfd);
+/* Waits for that, so long or as long as a restore waits; false: it has not ended. */
+bool pidfd_await_end(int pidfd, uint64_t ns);
 enum mapping_flag {
 	MAPPING_DONTFORK = 1,     /* dc */
 	MAPPING_WIPEONFORK = 2,   /* wf */

@@ -7,6 +7,9 @@
 #include "base.h"
 
 #define BYTES_MAX (UINT64_C(128) << 20)
+/* A restore with all its attempts, and each step of one, however late it begins. */
+#define RESTORE_NS (30 * NS_PER_S)
+#define STEP_NS (5 * NS_PER_S)
 
 static struct {
 	uint64_t bytes, end_ns;
@@ -14,6 +17,8 @@ static struct {
 	enum avc_code code;
 	void (*working)(void *arg);
 	void *arg;
+	uint64_t patient_until_ns; /* 0: there is no restore                          */
+	bool in_vain;              /* ... or nothing to restore to                    */
 } budget;
 
 void budget_begin(void (*working)(void *arg), void *arg)
@@ -63,6 +68,45 @@ bool budget_step(void)
 		budget_exceed(AVC_DEADLINE,
 			      "reading its state takes longer than it may stand still");
 	return !budget.exceeded;
+}
+
+bool budget_wait(void)
+{
+	heartbeat();
+	if (budget.patient_until_ns && budget.working)
+		budget.working(budget.arg);
+	return !budget.in_vain;
+}
+
+void restore_patience_begin(uint64_t until_ns)
+{
+	const uint64_t end = now_ns() + RESTORE_NS;
+
+	budget.patient_until_ns = until_ns && until_ns < end ? until_ns : end;
+	budget.in_vain = false;
+}
+
+void restore_is_in_vain(void)
+{
+	budget.in_vain = budget.patient_until_ns;
+}
+
+void restore_patience_end(void)
+{
+	budget.patient_until_ns = 0;
+	budget.in_vain = false;
+}
+
+uint64_t restore_patience(uint64_t ns)
+{
+	const uint64_t now = now_ns(), until = budget.patient_until_ns;
+	uint64_t patience = STEP_NS;
+
+	if (!until || budget.in_vain)
+		return ns;
+	if (until > now + patience)
+		patience = until - now;
+	return ns > patience ? ns : patience;
 }
 
 int budget_check(pid_t pid, struct avc_error *err)

@@ -20,6 +20,7 @@
 
 #define PF_EXITING 4 /* include/linux/sched.h; not for user space otherwise */
 #define PF_SIGNALED 0x400
+#define WAIT_STEP_NS (50 * NS_PER_MS)
 
 int proc_open(pid_t pid, const char *name, int flags)
 {
@@ -484,6 +485,18 @@ bool pidfd_ended(int pidfd)
 	struct pollfd p = { .fd = pidfd, .events = POLLIN };
 
 	return poll_for(&p, 1, 0) == 1;
+}
+
+bool pidfd_await_end(int pidfd, uint64_t ns)
+{
+	const uint64_t end = now_ns() + restore_patience(ns);
+	struct pollfd p = { .fd = pidfd, .events = POLLIN };
+
+	while (poll_for(&p, 1, WAIT_STEP_NS < ns ? WAIT_STEP_NS : ns) != 1) {
+		if (!budget_wait() || now_ns() >= end)
+			return false;
+	}
+	return true;
 }
 
 int proc_borrow_fd(int pidfd, int fd)

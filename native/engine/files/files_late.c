@@ -116,10 +116,8 @@ static int finish(const struct process *process)
 /* Whatever it still has is closed with it. */
 static void end(const struct process *process)
 {
-	struct pollfd ends = { .fd = process->holder_pidfd, .events = POLLIN };
-
 	syscall(SYS_pidfd_send_signal, process->holder_pidfd, SIGKILL, NULL, 0);
-	(void)poll_for(&ends, 1, ENDS_NS);
+	(void)pidfd_await_end(process->holder_pidfd, ENDS_NS);
 }
 
 uint64_t files_looked_at(const struct files_work *work)

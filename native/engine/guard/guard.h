@@ -111,6 +111,7 @@ struct avc_guard {
 	uint64_t restore_ticket;       /* of a command that has killed the app     */
 	enum avc_reason restore_asked; /* NONE: not requested                      */
 	uint64_t restore_generation;   /* requested by it; 0: the newest           */
+	uint64_t init_seen_ns;         /* alive, during a restore                  */
 	uint64_t late_ns;              /* when it is too late for a restore; 0: never */
 	struct files_written *written; /* avckpt.files; NULL: not watched           */
 	struct policy_pace pace;       /* avckpt.interval=auto                      */
@@ -318,6 +319,8 @@ void guard_release_remains(struct avc_guard *guard, pid_t pid);
 void guard_release_oldest_remains(struct avc_guard *guard, uint32_t left);
 /* Releases them when they were killed, or their time is up. */
 void guard_tend_remains(struct avc_guard *guard);
+/* From here to restore_patience_end(): what a restore waits for is waited for, and init told. */
+void guard_begin_patience(struct avc_guard *guard);
 /* Restores from the newest generation; if that fails, from the one before it; in a group only from
  * the newest.  `had`: how many there were when the app died. */
 bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,

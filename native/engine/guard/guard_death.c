@@ -12,7 +12,7 @@
 #include "guard.h"
 
 #define HOLDER_NS (1 * NS_PER_S) /* busy machines */
-#define HOLDER_STEP_US 200
+#define INIT_LOOK_NS (50 * NS_PER_MS)
 #define ENDS_NS (20 * NS_PER_MS)
 
 /* ---- death and restore --------------------------------------------------------- */
@@ -141,10 +141,18 @@ static void tell_restored(struct avc_guard *guard, struct avc_event *event,
 	guard_emit(guard, event);
 }
 
-/* During long work. */
-static void say_working(void *channel)
+/* During long work.  An init that was killed waits for all of our tracees to be reaped. */
+static void say_working(void *arg)
 {
-	init_channel_working(channel);
+	struct avc_guard *guard = arg;
+	const uint64_t now = now_ns();
+
+	init_channel_working(&guard->channel);
+	if (now - guard->init_seen_ns < INIT_LOOK_NS)
+		return;
+	guard->init_seen_ns = now;
+	if (proc_is_killed(guard->channel.init))
+		restore_is_in_vain();
 }
 
 static void release(struct avc_guard *guard, uint32_t i)
@@ -192,6 +200,13 @@ static void keep_remains(struct avc_guard *guard)
 	guard->remains[i].until_ns = now_ns() + guard->config.remains_ns;
 	/* Memory of a dead process goes before that of any running one. */
 	proc_set_oom_score_adj(guard->remains[i].pid, "1000");
+}
+
+void guard_begin_patience(struct avc_guard *guard)
+{
+	budget_begin(say_working, guard);
+	restore_patience_begin(guard->late_ns);
+	guard->init_seen_ns = now_ns();
 }
 
 static void drop_helper(struct avc_guard *guard)
@@ -266,7 +281,7 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 			guard_drop_all(guard);
 			break;
 		}
-		budget_begin(say_working, &guard->channel);
+		budget_begin(say_working, guard);
 		if (together && guard->dead.ended.count)
 			fail(&restore.notes, AVC_UNSUPPORTED, 0, guard->main.inside,
 			     "restore descriptors", "", "%u of its connections have ended: %s",
@@ -355,14 +370,9 @@ void guard_hold_all(struct avc_guard *guard)
 static void await_killed_holder(struct avc_guard *guard)
 {
 	const struct process *main = &guard->main;
-	const uint64_t end = now_ns() + HOLDER_NS;
 
-	if (!main->holder || !proc_is_killed(main->holder))
-		return;
-	while (!pidfd_ended(main->holder_pidfd) && now_ns() < end) {
-		init_channel_working(&guard->channel);
-		usleep(HOLDER_STEP_US);
-	}
+	if (main->holder && proc_is_killed(main->holder))
+		(void)pidfd_await_end(main->holder_pidfd, HOLDER_NS);
 }
 
 /* Before their PIDs are free, they have to end, and init to reap them.  While they do, the guard leaves
@@ -439,6 +449,7 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 	}
 	if (reason == AVC_REASON_COMMAND && guard->restore_generation)
 		guard_drop_newer(guard, guard->restore_generation);
+	guard_begin_patience(guard);
 	ready_helper(guard);
 	kill_descendants(guard);
 	await_killed_holder(guard);
@@ -458,6 +469,7 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 		guard_pace_restored(guard);
 	}
 out:
+	restore_patience_end();
 	if (!guard->dead.waits)
 		drop_helper(guard); /* if there was nothing to restore, after all */
 	guard->foreseen = 0;

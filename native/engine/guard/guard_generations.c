@@ -126,16 +126,20 @@ static bool knows_process(pid_t pid, const void *arg)
 
 void guard_wait_ended(struct avc_guard *guard)
 {
-	const uint64_t end = now_ns() + ENDED_NS;
+	const uint64_t end = tracee_deadline(ENDED_NS);
 	bool lent;
 
 	tracee_end_now();
-	while (tracee_reap_ending() && now_ns() < end)
+	while (tracee_reap_ending() && tracee_has_time(end))
 		usleep(ENDED_STEP_US);
 	/* On a busy machine it would not get to it in time. */
 	lent = rt_priority_lend(guard->channel.init);
-	while (init_channel_has_zombies(&guard->channel) && now_ns() < end)
+	while (init_channel_has_zombies(&guard->channel) && tracee_has_time(end)) {
+		/* It cannot reap one of ours before we have. */
+		(void)guard_tend_stragglers(guard);
+		guard_reap_unknown(guard);
 		usleep(ENDED_STEP_US);
+	}
 	if (lent)
 		rt_priority_reclaim(guard->channel.init);
 }

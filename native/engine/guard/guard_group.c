@@ -323,6 +323,7 @@ static void go_back(struct avc_guard *guard)
 	bool back = false;
 
 	rt_priority_begin();
+	guard_begin_patience(guard);
 	guard->dead.waits = true; /* so that meet() notifies init of progress */
 	if (guard_find_generation(guard, guard->recall) >= 0 &&
 	    meet(guard, RECALL_DEAD, DEAD_NS, &error) == 0) {
@@ -332,6 +333,7 @@ static void go_back(struct avc_guard *guard)
 		       guard_bring_back(guard, &guard->dead.report, guard->dead.reason,
 					guard->dead.had, &error);
 	}
+	restore_patience_end();
 	guard_leave_meeting(guard);
 	guard->dead.waits = false;
 	if (back) {

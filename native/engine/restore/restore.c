@@ -7,7 +7,6 @@
 #include <dirent.h>
 #include <errno.h>
 #include <linux/futex.h>
-#include <poll.h>
 #include <sched.h>
 #include <signal.h>
 #include <stdlib.h>
@@ -23,9 +22,10 @@
 #define TRIES 8 /* at once */
 #define TRY_NS NS_PER_S
 #define TRY_AGAIN_NS (NS_PER_MS / 2)
+#define NAP_MAX_NS (10 * NS_PER_MS)
 #define READY_NS (2 * NS_PER_S)
 #define GONE_NS NS_PER_S
-#define FORK_NS (5 * NS_PER_S)
+#define STEP_NS (5 * NS_PER_S)
 #define STAGGER_MS 20
 
 static const char *const step_names[] = {
@@ -41,7 +41,7 @@ static bool wait_word(uint32_t *word, uint32_t value, int pidfd, uint64_t end)
 	const struct timespec slice = { .tv_nsec = (long)NS_PER_MS };
 
 	while (__atomic_load_n(word, __ATOMIC_ACQUIRE) == value) {
-		if (now_ns() > end || pidfd_ended(pidfd))
+		if (!tracee_has_time(end) || pidfd_ended(pidfd))
 			return false;
 		syscall(SYS_futex, word, FUTEX_WAIT, value, &slice, NULL, 0);
 	}
@@ -52,7 +52,7 @@ static bool wait_word(uint32_t *word, uint32_t value, int pidfd, uint64_t end)
 static int await_state(struct inj_slot *slot, struct sandbox *sandbox, int pidfd,
 		       struct avc_error *err)
 {
-	const uint64_t end = now_ns() + READY_NS;
+	const uint64_t end = tracee_deadline(READY_NS);
 
 	if (sandbox ? sandbox_wait(sandbox, &slot->state, end)
 		    : wait_word(&slot->state, INJ_IDLE, pidfd, end))
@@ -183,6 +183,11 @@ static int describe_failure(const struct parasite *parasite, const struct inj_sl
 
 /* A number is taken as long as a process has it, or as its group or session (kernel/pid.c,
  * __change_pid()), which a zombie keeps. */
+static bool has_number(const struct proc_status *status, pid_t number)
+{
+	return status->inside == number || status->group == number || status->session == number;
+}
+
 int restore_fail_taken(pid_t init, pid_t number, struct avc_error *err)
 {
 	char inside[64] = "", its[64];
@@ -197,7 +202,7 @@ int restore_fail_taken(pid_t init, pid_t number, struct avc_error *err)
 
 		if (other > 0 && proc_link(other, "ns/pid", its, sizeof its) >= 0 &&
 		    !strcmp(its, inside) && !proc_status(other, &status) &&
-		    (status.inside == number || status.group == number || status.session == number))
+		    has_number(&status, number))
 			pid = other;
 	}
 	if (proc)
@@ -213,6 +218,48 @@ int restore_fail_taken(pid_t init, pid_t number, struct avc_error *err)
 					     : " as its session");
 }
 
+/* A dead process has it, or one that is dying: until init gets a CPU to reap it. */
+static bool the_dead_have(pid_t init, pid_t number)
+{
+	pid_t children[CHILDREN_MAX];
+	const int count = proc_children(init, children, CHILDREN_MAX);
+
+	for (int i = 0; i < count; i++) {
+		struct proc_status status;
+		struct proc_stat stat;
+
+		if (!proc_status(children[i], &status) && !proc_stat(children[i], &stat) &&
+		    has_number(&status, number) &&
+		    (stat.state == 'Z' || stat.state == 'X' || proc_is_killed(children[i])))
+			return true;
+	}
+	return false;
+}
+
+bool restore_number_gets_free(const struct restore *restore, pid_t number, uint64_t *since_ns)
+{
+	const uint64_t end = tracee_deadline(TRY_NS);
+
+	uint64_t nap_ns = TRY_AGAIN_NS;
+
+	while (the_dead_have(restore->channel->init, number)) {
+		if (!tracee_has_time(end))
+			return false;
+		/* Each look takes from what CPU there may be for both of us. */
+		usleep((useconds_t)(nap_ns / 1000));
+		nap_ns = nap_ns < NAP_MAX_NS ? 2 * nap_ns : nap_ns;
+		*since_ns = now_ns();
+	}
+	return now_ns() - *since_ns < TRY_NS;
+}
+
+/* The total time depends on the size, and on who gets a CPU: deadlines are per step. */
+void restore_go_on(const struct restore *restore)
+{
+	tracee_deadline_set(restore->timer, restore_patience(STEP_NS));
+	init_channel_working(restore->channel);
+}
+
 /* Forks until the PID is the app's; in a shared PID namespace other processes may fork in
  * between. */
 static int rebuild(struct restore *restore, struct avc_error *err)
@@ -220,11 +267,13 @@ static int rebuild(struct restore *restore, struct avc_error *err)
 	const struct image *image = &restore->generation->image[0];
 	const struct parasite *parasite = &image->process->parasite;
 	struct inj_slot *slot = parasite_slot(parasite, image->slot);
-	const uint64_t end = now_ns() + TRY_NS;
+	uint64_t since = now_ns();
 
-	for (int i = 0; i < TRIES || now_ns() < end; i++) {
+	for (int i = 0; !i || restore_number_gets_free(restore, slot->pid, &since) || i < TRIES;
+	     i++) {
 		uint64_t start;
 
+		restore_go_on(restore);
 		/* The dead app's number may be free only some time after it was
 		 * reaped; see spawn() in parasite.c. */
 		if (i >= TRIES)
@@ -274,7 +323,7 @@ void restore_await_spawned(const struct image *image, int pidfd)
 {
 	struct inj_slot *slot = parasite_slot(&image->process->parasite, image->slot);
 
-	(void)wait_word(&slot->spawned, 0, pidfd, now_ns() + READY_NS);
+	(void)wait_word(&slot->spawned, 0, pidfd, tracee_deadline(READY_NS));
 }
 
 int restore_await(const struct image *image, int pidfd, struct sandbox *sandbox,
@@ -387,6 +436,7 @@ static int make(struct restore *restore, struct avc_error *err)
 
 	if (make_spare_first(restore, err))
 		return -1;
+	restore_go_on(restore);
 	restore->dropped = files_restore(generation->image, generation->images, restore->config,
 					 restore->channel->init, &restore->notes, err);
 	if (restore->dropped < 0)
@@ -396,7 +446,6 @@ static int make(struct restore *restore, struct avc_error *err)
 		if (!restore->tree)
 			return -1;
 	}
-	init_channel_working(restore->channel);
 	spare_ns = restore->fork_ns;
 	result = rebuild(restore, err);
 	restore->fork_ns += spare_ns;
@@ -414,10 +463,8 @@ static void take_back(struct restore *restore)
 	if (restore->sandbox)
 		sandbox_end(restore->sandbox);
 	if (restore->pidfd >= 0) {
-		struct pollfd gone = { .fd = restore->pidfd, .events = POLLIN };
-
 		syscall(SYS_pidfd_send_signal, restore->pidfd, SIGKILL, NULL, 0);
-		(void)poll_for(&gone, 1, GONE_NS);
+		(void)pidfd_await_end(restore->pidfd, GONE_NS);
 	}
 	if (restore->tree)
 		restore_tree_kill(restore->tree);
@@ -504,7 +551,7 @@ int restore_app(struct restore *restore, struct avc_error *err)
 		restore->helper = start_helper(generation, restore->channel, err);
 	if (!restore->helper)
 		return -1;
-	tracee_deadline_set(restore->timer, FORK_NS);
+	restore_go_on(restore);
 	result = make(restore, err);
 	tracee_deadline_clear(restore->timer);
 	last_pid_stop(restore->helper);
@@ -517,6 +564,8 @@ int restore_app(struct restore *restore, struct avc_error *err)
 				 ? -1
 				 : 0;
 	}
+	if (!result)
+		restore_patience_end(); /* it has its verdict, and is not to wait for anybody */
 	if (result)
 		take_back(restore);
 	else

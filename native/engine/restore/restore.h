@@ -47,6 +47,11 @@ struct restore {
 struct last_pid *restore_ahead(const struct generation *generation,
 			       const struct init_channel *channel);
 int restore_app(struct restore *restore, struct avc_error *err) warn_unused;
+/* Whether to try again to get it: while a dead process has it, which is waited for, and for a second
+ * since then, or since `*since_ns`. */
+bool restore_number_gets_free(const struct restore *restore, pid_t number, uint64_t *since_ns);
+/* Begins a step, which has its own deadline. */
+void restore_go_on(const struct restore *restore);
 /* Fails with who has a PID of the container of `init`: as its own, or as that of its group or
  * session.  Always returns -1. */
 int restore_fail_taken(pid_t init, pid_t number, struct avc_error *err);

@@ -11,7 +11,6 @@
 
 #include "restore_tree.h"
 
-#define TRY_NS NS_PER_S
 #define TRY_AGAIN_US 200
 /* Calls of a parent for one fork: it closes a socket, receives one, and forks. */
 #define FORK_CALLS 3
@@ -229,14 +228,16 @@ static int give_birth(struct birth *birth, pid_t *child, struct avc_error *err)
 {
 	struct restore_tree *restored = birth->restored;
 	struct syscall_batch *host = &birth->host->batch;
-	const uint64_t end = now_ns() + TRY_NS;
+	const struct restore *restore = restored->restore;
+	uint64_t since = now_ns();
 
-	for (bool again = birth->copy; now_ns() < end; again = true) {
+	for (bool again = birth->copy;
+	     !again || restore_number_gets_free(restore, birth->number, &since); again = true) {
 		struct avc_error failed = { 0 };
 		bool made;
 
 		if (again) {
-			init_channel_working(restored->restore->channel);
+			restore_go_on(restore);
 			usleep(TRY_AGAIN_US);
 			restore_fork_note(birth->host, birth->exit_signal);
 		}
@@ -266,7 +267,7 @@ static int give_birth(struct birth *birth, pid_t *child, struct avc_error *err)
 			return -1;
 		birth->copy = 0;
 	}
-	return restore_fail_taken(restored->restore->channel->init, birth->number, err);
+	return restore_fail_taken(restore->channel->init, birth->number, err);
 }
 
 /* ---- keepers ---------------------------------------------------------------------------------- */

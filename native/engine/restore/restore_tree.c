@@ -10,7 +10,6 @@
  * all children at the same time, while their parent forks the next one.
  */
 #include <errno.h>
-#include <poll.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/ioctl.h>
@@ -22,7 +21,6 @@
 
 #include "restore_tree.h"
 
-#define STEP_NS (5 * NS_PER_S)
 #define GONE_NS NS_PER_S
 #define FILES_SPARE 64
 
@@ -191,13 +189,6 @@ static int join_group(struct restore_tree *restored, uint32_t index, struct avc_
 		       : 0;
 }
 
-/* The total time depends on the size: deadlines are per step. */
-static void go_on(struct restore_tree *restored)
-{
-	tracee_deadline_set(restored->restore->timer, STEP_NS);
-	init_channel_working(restored->restore->channel);
-}
-
 /* ---- from a fork to what its template is -------------------------------------------------- */
 
 static int advance(struct restore_tree *restored, uint32_t index, struct avc_error *err);
@@ -274,7 +265,7 @@ static int advance(struct restore_tree *restored, uint32_t index, struct avc_err
 	struct syscall_batch *batch = &forked->batch;
 	bool changed = false;
 
-	go_on(restored);
+	restore_go_on(restored->restore);
 	if (forked->stage == STAGE_FORKED) {
 		forked->stage = STAGE_MOVES;
 		return move_in(restored, index, err) || syscall_batch_start(batch, err) ? -1 : 0;
@@ -331,7 +322,7 @@ static void do_chores(void *arg)
 static int finish_copies(struct restore_tree *restored, struct avc_error *err)
 {
 	while (copier_help(restored->copier))
-		go_on(restored);
+		restore_go_on(restored->restore);
 	return copier_finish(restored->copier, err);
 }
 
@@ -367,7 +358,7 @@ static int make_one(struct restore_tree *restored, uint32_t index, struct avc_er
 	struct forked *forked = &restored->forked[index];
 	struct chores chores = { .restored = restored, .child = image->process ? index : 0 };
 
-	go_on(restored);
+	restore_go_on(restored->restore);
 	if (restore_fork(restored, index, do_chores, &chores, err))
 		return -1;
 	forked->batch.pid = forked->pid;
@@ -645,12 +636,9 @@ void restore_tree_kill(struct restore_tree *restored)
 	restore_fork_kill(restored);
 	for (uint32_t i = restored->generation->images; i-- > 0;)
 		kill_one(&restored->forked[i]);
-	for (uint32_t i = 1; i < restored->generation->images; i++) {
-		struct pollfd gone = { .fd = restored->forked[i].pidfd, .events = POLLIN };
-
-		if (gone.fd >= 0)
-			(void)poll_for(&gone, 1, GONE_NS);
-	}
+	for (uint32_t i = 1; i < restored->generation->images; i++)
+		if (restored->forked[i].pidfd >= 0)
+			(void)pidfd_await_end(restored->forked[i].pidfd, GONE_NS);
 }
 
 void restore_tree_free(struct restore_tree *restored)

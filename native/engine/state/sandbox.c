@@ -86,7 +86,7 @@ bool sandbox_wait(struct sandbox *sandbox, const uint32_t *state, uint64_t end)
 
 	/* It stops so often that sleeping would take most of the time. */
 	for (int looks = 0; __atomic_load_n(state, __ATOMIC_ACQUIRE) == INJ_IDLE;) {
-		if (ended || now_ns() > end)
+		if (ended || !tracee_has_time(end))
 			return false;
 		if (pump(sandbox, &ended))
 			looks = 0;
@@ -100,12 +100,12 @@ bool sandbox_wait(struct sandbox *sandbox, const uint32_t *state, uint64_t end)
 
 void sandbox_end(struct sandbox *sandbox)
 {
-	const uint64_t end = now_ns() + END_NS;
+	const uint64_t end = tracee_deadline(END_NS);
 	bool ended = false;
 
 	tracee_signal(sandbox->pid, SIGKILL);
 	/* The first thread is reported when all the others have been waited for. */
-	while (!ended && now_ns() < end)
+	while (!ended && tracee_has_time(end))
 		if (!pump(sandbox, &ended))
 			usleep(LOOK_US);
 	free(sandbox);

@@ -332,7 +332,7 @@ int init_channel_kill_leftovers(struct init_channel *channel,
 				bool (*keep)(pid_t pid, const void *arg), void (*tend)(void *arg),
 				void *arg, struct avc_error *err)
 {
-	const uint64_t start = now_ns();
+	const uint64_t start = now_ns(), end = tracee_deadline(LEFTOVERS_ALIVE_NS);
 	uint64_t alive_ns = start;
 	pid_t alive;
 
@@ -359,7 +359,7 @@ int init_channel_kill_leftovers(struct init_channel *channel,
 		/* A zombie's PID may be needed or not: that shows later. */
 		if (!any || now - alive_ns > LEFTOVERS_NS)
 			return 0;
-		if (alive && now - start > LEFTOVERS_ALIVE_NS)
+		if (alive && !tracee_has_time(end))
 			return fail(err, AVC_DEADLINE, 0, alive, "restore", "",
 				    "a process that was killed does not end");
 		init_channel_working(channel);

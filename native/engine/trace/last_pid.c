@@ -66,12 +66,11 @@ int last_pid_lock_open(pid_t init)
 
 bool last_pid_lock(int fd, bool urgent)
 {
-	const uint64_t end = now_ns() + (urgent ? LOCK_URGENT_NS : LOCK_NS);
+	const uint64_t end = tracee_deadline(urgent ? LOCK_URGENT_NS : LOCK_NS);
 
 	while (fd >= 0 && flock(fd, (urgent ? LOCK_EX : LOCK_SH) | LOCK_NB)) {
-		if (now_ns() > end)
+		if (!tracee_has_time(end))
 			return false;
-		heartbeat();
 		usleep(urgent ? LOCK_STEP_US : LOCK_STEPS * LOCK_STEP_US);
 	}
 	return true;
@@ -379,10 +378,9 @@ static void wake(uint32_t *word)
 	syscall(SYS_futex, word, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
 }
 
-/* Waits until the helper has set *word as wanted; false: not within `ns`, or it has exited. */
-static bool await_word(const struct last_pid *helper, uint32_t *word, uint32_t wanted, uint64_t ns)
+/* Waits until the helper has set *word as wanted; false: not until `end`, or it has exited. */
+static bool await_word(const struct last_pid *helper, uint32_t *word, uint32_t wanted, uint64_t end)
 {
-	const uint64_t end = now_ns() + ns;
 	uint32_t value;
 
 	for (uint32_t spins = 0; (value = __atomic_load_n(word, __ATOMIC_ACQUIRE)) != wanted;
@@ -391,7 +389,7 @@ static bool await_word(const struct last_pid *helper, uint32_t *word, uint32_t w
 			cpu_relax();
 			continue;
 		}
-		if (now_ns() > end || pidfd_ended(helper->pidfd))
+		if (!tracee_has_time(end) || pidfd_ended(helper->pidfd))
 			return false;
 		sleep_on(word, value);
 	}
@@ -407,7 +405,7 @@ int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err)
 	slot->last_pid = value;
 	want = __atomic_add_fetch(&slot->want, 1, __ATOMIC_ACQ_REL);
 	wake(&slot->want);
-	if (!await_word(helper, &slot->have, want, NS_PER_S))
+	if (!await_word(helper, &slot->have, want, tracee_deadline(NS_PER_S)))
 		return fail(err, AVC_KERNEL, ETIMEDOUT, 0, "restore", "write(ns_last_pid)",
 			    "the helper does not answer (setns(2) into the container takes "
 			    "CAP_SYS_ADMIN and CAP_SYS_CHROOT)");
@@ -441,7 +439,7 @@ void last_pid_stop(struct last_pid *helper)
 {
 	__atomic_store_n(&helper->page->stop, 1, __ATOMIC_RELEASE);
 	rouse(served(helper));
-	(void)await_word(helper, &helper->page->stopped, 1, STOP_NS);
+	(void)await_word(helper, &helper->page->stopped, 1, now_ns() + STOP_NS);
 }
 
 void last_pid_end(struct last_pid *helper)

@@ -231,13 +231,13 @@ void parasite_clear_undo(struct process *process)
 static int wait_word(struct inj_call *call, uint32_t *word, pid_t tid, struct avc_error *err)
 {
 	const struct timespec slice = { .tv_nsec = 500000 };
-	const uint64_t end = now_ns() + (call->after == INJ_AFTER_PARK ? PARKED_NS : HOMEWARD_NS);
+	const uint64_t end = call->after == INJ_AFTER_PARK ? tracee_deadline(PARKED_NS)
+							   : now_ns() + HOMEWARD_NS;
 
 	while (!__atomic_load_n(word, __ATOMIC_ACQUIRE)) {
 		const bool supervised = seccomp_is_supervised(tid);
 		struct stop stop;
 
-		heartbeat();
 		/* A supervised task stops at every call. */
 		if (!supervised)
 			syscall(SYS_futex, word, FUTEX_WAIT, 0, &slice, NULL, 0);
@@ -251,7 +251,7 @@ static int wait_word(struct inj_call *call, uint32_t *word, pid_t tid, struct av
 		if (stop.kind == STOP_SIGNAL || stop.kind == STOP_GROUP ||
 		    stop.kind == STOP_SYSCALL)
 			seccomp_go_on(tid, &stop);
-		if (now_ns() > end)
+		if (!tracee_has_time(end))
 			return fail(err, AVC_DEADLINE, 0, tid, "run injected code", "",
 				    "the task did not get to run in time");
 	}

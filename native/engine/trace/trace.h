@@ -295,6 +295,10 @@ int tracee_poll(struct pollfd *fds, nfds_t n, const struct timespec *timeout);
 void tracee_deadline_set(timer_t timer, uint64_t ns);
 void tracee_deadline_clear(timer_t timer);
 bool tracee_deadline_passed(void);
+/* For a loop that waits, with looks at something else: when it is to end (restore_patience()), and
+ * before each look whether it may go on. */
+uint64_t tracee_deadline(uint64_t ns);
+bool tracee_has_time(uint64_t end_ns);
 
 enum stop_kind {
 	STOP_TRAP,  /* our PTRACE_INTERRUPT, or a new tracee's first stop     */

@@ -123,6 +123,16 @@ bool tracee_deadline_passed(void)
 	return deadline_ns && now_ns() >= deadline_ns;
 }
 
+uint64_t tracee_deadline(uint64_t ns)
+{
+	return now_ns() + restore_patience(ns);
+}
+
+bool tracee_has_time(uint64_t end_ns)
+{
+	return budget_wait() && now_ns() <= end_ns;
+}
+
 /* A killed leader is not reported until all its other threads have been reaped, which only we can
  * do, one after the other. */
 static bool is_dying(pid_t tid)
@@ -164,7 +174,8 @@ static struct stop wait_ticking(pid_t tid, int options, void (*tick)(void))
 		if (r < 0 && errno == EINTR) {
 			stop.kind = is_dying(tid) ? STOP_DYING : STOP_DEADLINE;
 			if (stop.kind == STOP_DYING || tracee_deadline_passed() ||
-			    (watched && __atomic_load_n(watched, __ATOMIC_ACQUIRE)))
+			    (watched && __atomic_load_n(watched, __ATOMIC_ACQUIRE)) ||
+			    !budget_wait())
 				return stop;
 			if (tick)
 				tick();
@@ -343,12 +354,12 @@ int tracee_seize(pid_t tid, long options)
 
 avc_remote tracee_pc(pid_t tid)
 {
-	const uint64_t end = now_ns() + PC_NS;
+	const uint64_t end = tracee_deadline(PC_NS);
 	struct arch_regs regs;
 
 	/* Fails until it is stopped. */
 	while (arch_regs_get(tid, &regs)) {
-		if (now_ns() > end || is_dying(tid))
+		if (!tracee_has_time(end) || is_dying(tid))
 			return 0;
 		usleep(PC_STEP_US);
 	}
@@ -415,15 +426,22 @@ void tracee_signal(pid_t pid, int signal)
 
 void tracee_kill(pid_t pid)
 {
+	/* In a restore init hears meanwhile that it goes on: its end may take a CPU that others have. */
+	const uint64_t end = tracee_deadline(0);
+	const struct timespec tick = { .tv_nsec = TICK_NS };
+
 	tracee_signal(pid, SIGKILL);
 	for (;;) {
 		int status;
-		pid_t r = waitpid(pid, &status, __WALL | __WNOTHREAD);
+		pid_t r = waitpid(pid, &status,
+				  __WALL | __WNOTHREAD | (tracee_has_time(end) ? WNOHANG : 0));
 
 		if (r == pid && (WIFEXITED(status) || WIFSIGNALED(status)))
 			return;
 		if (r < 0 && errno != EINTR)
 			return;
+		if (r == 0)
+			(void)tracee_poll(NULL, 0, &tick);
 	}
 }
 
