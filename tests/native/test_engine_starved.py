@@ -17,7 +17,7 @@ import pytest
 
 from testkit.cgroups import freezer, throttle
 from testkit.family import kill_main
-from testkit.guarded import PATIENCE_S, WHERE, GuardProcess, Victim, config
+from testkit.guarded import PATIENCE_S, WHERE, GuardProcess, Victim, config, injected
 from testkit.harness import wait_until
 from testkit.procfs import children_of, comm_of, status_of
 
@@ -35,6 +35,9 @@ GUARDS = 60
 
 LATE_S = 1.5
 """Longer than a checkpoint waits for a template, and than a restore used to."""
+
+REAPED_S = 4.0
+"""Longer than all attempts of a restore used to take."""
 
 IN_STUB = 3
 """Threads that have not left the first injected instructions in time."""
@@ -266,6 +269,19 @@ def test_restored_by_and_by(late_guard: bool, command: str, tmp_path: Path) -> N
         late.go()
         assert (ends[0]["kind"], ends[0].get("generation")) == ("restored", taken["generation"]), ends
         victim.wait_beats(20)
+
+
+def test_the_dead_are_reaped_late(tmp_path: Path) -> None:
+    """init gets no CPU when it has reported the death.  Until it does, the dead children have their PIDs."""
+    with Victim("tree 8", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        taken = guard.checkpoint()
+        # The first finds the main process, the second nobody, or a child.
+        with injected(victim, "wait4", f"delay_enter={REAPED_S * 1e6:.0f}:when=2"):
+            kill_main(victim)
+            end = guard.wait_for(lambda event: event["kind"] in ("restored", "gave_up"), "end")
+        assert (end["kind"], end.get("generation")) == ("restored", taken["generation"]), end
+        assert end["restore_s"] > REAPED_S / 2, "nobody was late"
+        victim.wait_beats(10)
 
 
 def test_who_was_killed_and_has_yet_to_die_takes_nothing(cpus: tuple[int, int], tmp_path: Path) -> None:
