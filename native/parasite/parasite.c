@@ -29,6 +29,7 @@
 #define SPAWN_TRIES 4000
 #define SPAWN_TRIES_AT_ONCE 8
 #define SPAWN_PAUSE_US 100
+#define EAGAIN_ 11
 
 /* For the answer of the engine's helper, which is fast when it has a CPU. */
 #define ASK_SPINS 2000
@@ -550,26 +551,30 @@ static void spawn(struct inj_slot *slot, struct inj_thread *t, int32_t *last)
 {
 	const uint64_t flags = CLONE_VM | CLONE_FS | CLONE_FILES | CLONE_SIGHAND | CLONE_THREAD |
 			       CLONE_SYSVSEM | CLONE_SETTLS;
+	long tid = 0;
 
 	for (int i = 0; i < SPAWN_TRIES; i++) {
-		long tid;
-
 		/* Another process's fork took the number, or the dead app's thread still has it:
 		 * the kernel lets its leader be reaped slightly before it frees the number
 		 * (kernel/exit.c, release_task(), free_pids()), and the dying thread may be waiting
 		 * for a CPU just then. */
-		if (i >= SPAWN_TRIES_AT_ONCE)
+		if (i >= SPAWN_TRIES_AT_ONCE || tid < 0)
 			pause_us(SPAWN_PAUSE_US);
 		if (*last + 1 != t->tid)
 			ask_last_pid(slot, t->tid - 1);
 		tid = inj_spawn(flags, t->stack, t->tls, t, slot, t->tid);
-		if (tid < 0)
-			fail(slot, INJ_STEP_THREAD, t->tid, tid);
+		/* At the limit of tasks one that has gone astray, and has yet to get a CPU for its
+		 * end, is one too many. */
+		if (tid < 0 && !(tid == -EAGAIN_ && slot->astray))
+			break;
 		*last = (int32_t)tid;
 		if (tid == t->tid)
 			return;
 		*last = -1;
+		slot->astray = 1;
 	}
+	if (tid < 0)
+		fail(slot, INJ_STEP_THREAD, t->tid, tid);
 	fail(slot, INJ_STEP_TID, t->tid, -17 /* EEXIST */);
 }
 

@@ -203,6 +203,7 @@ struct inj_slot {
 	uint32_t spawned; /* futex: 1 when all threads exist, or it has failed   */
 	uint32_t ready;   /* threads that have set themselves up            */
 	uint32_t running; /* threads about to return to the app */
+	uint32_t astray;  /* tasks were made with wrong numbers, and may have yet to end */
 	/* ns_last_pid, written by the engine's helper on request               */
 	uint32_t want;     /* incremented by R for each request              */
 	uint32_t have;     /* set to `want` by the helper                    */

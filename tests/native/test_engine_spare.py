@@ -189,7 +189,10 @@ def test_none_when_checkpoints_are_too_frequent(tmp_path: Path) -> None:
         die_and_come_back(victim, guard)
 
 
-SOMEBODY = "/usr/bin/setpriv --reuid 54322 --regid 54322 --clear-groups --bounding-set -all --inh-caps -all"
+USER = 1_000_000 + os.getpid()
+"""The limit counts a user's tasks on all of the machine: those of another run of these tests must not be among them."""
+SOMEBODY = f"/usr/bin/setpriv --reuid {USER} --regid {USER} --clear-groups --bounding-set -all --inh-caps -all"
+DEATHS = 20
 
 
 def processes_of(user: int) -> list[int]:
@@ -205,7 +208,7 @@ def limited(processes: int, victim: str = "idle 0 4") -> Iterator[tuple[Victim, 
         forks = config(keep=1, images=Images.FORK)
         with Victim(command, Path(folder)) as made, GuardProcess(forks, [made.pid]) as guard:
             yield made, guard
-        wait_until(lambda: not processes_of(54322), PATIENCE_S, "nobody is left who counts with the next ones")
+        wait_until(lambda: not processes_of(USER), PATIENCE_S, "nobody is left who counts with the next ones")
 
 
 def test_none_when_it_may_not_have_another_process() -> None:
@@ -214,6 +217,15 @@ def test_none_when_it_may_not_have_another_process() -> None:
         time.sleep(0.1)
         assert not spares(victim)
         for _ in range(5):
+            die_and_come_back(victim, guard)
+        assert not [event for event in guard.events if event.get("kind") == "dropped"]
+
+
+def test_a_thread_with_a_wrong_number_is_one_too_many() -> None:
+    """Others take numbers of its threads, and the thread that got another one instead has yet to end."""
+    with limited(6) as (victim, guard), forks_beside(victim):
+        assert guard.checkpoint()["kind"] == "checkpoint"
+        for _ in range(DEATHS):
             die_and_come_back(victim, guard)
         assert not [event for event in guard.events if event.get("kind") == "dropped"]
 

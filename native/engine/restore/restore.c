@@ -70,6 +70,7 @@ static void reset(const struct parasite *parasite, uint32_t slot_number)
 	slot->state = INJ_IDLE;
 	slot->go = INJ_GO_NOT;
 	slot->spawned = 0;
+	slot->astray = 0;
 	slot->ready = 0;
 	slot->running = 0;
 	slot->error = 0;
@@ -268,6 +269,7 @@ static int rebuild(struct restore *restore, struct avc_error *err)
 	const struct parasite *parasite = &image->process->parasite;
 	struct inj_slot *slot = parasite_slot(parasite, image->slot);
 	uint64_t since = now_ns();
+	struct avc_error failed = { 0 };
 
 	for (int i = 0; !i || restore_number_gets_free(restore, slot->pid, &since) || i < TRIES;
 	     i++) {
@@ -276,13 +278,21 @@ static int rebuild(struct restore *restore, struct avc_error *err)
 		restore_go_on(restore);
 		/* The dead app's number may be free only some time after it was
 		 * reaped; see spawn() in parasite.c. */
-		if (i >= TRIES)
+		if (i >= TRIES || failed.code)
 			usleep(TRY_AGAIN_NS / 1000);
 		start = now_ns();
 		reset(parasite, image->slot);
-		if (last_pid_set(restore->helper, slot->pid - 1, err) ||
-		    fork_template(restore, i > 0, err))
+		slot->astray = i > 0;
+		failed.code = AVC_OK;
+		if (last_pid_set(restore->helper, slot->pid - 1, err))
 			return -1;
+		if (fork_template(restore, i > 0, &failed)) {
+			/* At the limit of tasks the one with a wrong number is one too many, until
+			 * init has reaped it. */
+			if (i && failed.code == AVC_LIMIT)
+				continue;
+			break;
+		}
 		restore->fork_ns = now_ns() - start;
 		if (restore->tree && slot->state == INJ_IDLE) {
 			if (restore_tree_make(restore->tree, err) ||
@@ -302,6 +312,10 @@ static int rebuild(struct restore *restore, struct avc_error *err)
 		restore->sandbox = NULL;
 		if (slot->state == INJ_FAILED)
 			return describe_failure(parasite, slot, err);
+	}
+	if (failed.code) {
+		*err = failed;
+		return -1;
 	}
 	return restore_fail_taken(restore->channel->init, slot->pid, err);
 }
