@@ -428,6 +428,10 @@ WHERE = ("", "--in-child")
 """What a test of a victim is done with: the main process does everything, or a child of it."""
 
 
+ROUND_S = 1.0
+"""A round of a storm is as long as first checkpoints take, here and now: long where others take the CPU."""
+
+
 def storm(guard_config: GuardConfig, kills: int, reach: float, seed: int, *victims: Victim) -> dict[str, object]:
     """Runs kill_storm.py; what it says at the end."""
     fields = {**dataclasses.asdict(guard_config), "restore_on_statuses": []}
@@ -438,7 +442,7 @@ def storm(guard_config: GuardConfig, kills: int, reach: float, seed: int, *victi
         ],
         capture_output=True,
         text=True,
-        timeout=110 * SLOWNESS,
+        timeout=PATIENCE_S + kills * ROUND_S * SLOWNESS,
         check=False,
         cwd=ROOT,
     )

@@ -15,7 +15,10 @@ from testkit.guarded import GuardProcess, Victim, config, parasites, storm
 from testkit.harness import wait_until
 from testkit.procfs import threads
 
-pytestmark = pytest.mark.shared_machine("guards are killed at random moments, and each next one has to protect in time")
+pytestmark = [
+    pytest.mark.shared_machine("guards are killed at random moments, and each next one has to protect in time"),
+    pytest.mark.timeout(700),  # storm() has its own
+]
 
 KILLS = 500
 PTRACE_CALLS = 40

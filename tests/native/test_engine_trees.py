@@ -366,6 +366,7 @@ def test_it_ends_as_its_main_process_does(tmp_path: Path) -> None:
 
 
 @SHARED
+@pytest.mark.timeout(700)  # storm() has its own
 def test_no_process_notices_that_its_tracer_was_killed(tmp_path: Path) -> None:
     """The guard dies before, during and after checkpoints; no process is left stopped, no template ever runs."""
     with contextlib.ExitStack() as stack:
