@@ -90,7 +90,7 @@ class Completed:
         return f"`{' '.join(self.args)}` ended with {self.status} after {self.took_s:.2f} s: {said}"
 
 
-def take_checkpoint(client: Client, name: str, timeout_s: float = 20) -> None:
+def take_checkpoint(client: Client, name: str, timeout_s: float = 20 * SLOWNESS) -> None:
     """As soon as there is something to take one of; a busy machine may be too slow for the freeze deadline."""
 
     def taken() -> bool:
@@ -113,7 +113,7 @@ class CommandFailed(AssertionError):
 def run(
     args: Sequence[str],
     *,
-    timeout_s: float = 60.0,
+    timeout_s: float = 60.0 * SLOWNESS,
     check: bool = True,
     stdin: str | None = None,
     env: Mapping[str, str] | None = None,
@@ -162,7 +162,7 @@ class Podman:
     def run(
         self,
         *args: str,
-        timeout_s: float = 60.0,
+        timeout_s: float = 60.0 * SLOWNESS,
         check: bool = True,
         stdin: str | None = None,
         shielded: bool = False,
@@ -170,7 +170,7 @@ class Podman:
         """`podman ARGS`; see `run()` above."""
         return run([*self.command, *args], timeout_s=timeout_s, check=check, stdin=stdin, shielded=shielded)
 
-    def json(self, *args: str, timeout_s: float = 60.0) -> Any:
+    def json(self, *args: str, timeout_s: float = 60.0 * SLOWNESS) -> Any:
         """What `podman ARGS` prints, read as JSON."""
         return json.loads(self.run(*args, timeout_s=timeout_s).stdout)
 
@@ -232,7 +232,7 @@ class Container:
         done = self.podman.run("logs", self.name)
         return done.stdout + done.stderr
 
-    def wait_for_log(self, text: str, timeout_s: float = 20.0, count: int = 1) -> str:
+    def wait_for_log(self, text: str, timeout_s: float = 20.0 * SLOWNESS, count: int = 1) -> str:
         """Waits until `text` was logged `count` times; returns the log."""
 
         def seen() -> str:
@@ -244,7 +244,7 @@ class Container:
         except TimeoutError as error:
             raise TimeoutError(f"{error}; the log: {self.logs()[-2000:]!r}") from None
 
-    def exec(self, *command: str, timeout_s: float = 30.0, check: bool = True) -> Completed:
+    def exec(self, *command: str, timeout_s: float = 30.0 * SLOWNESS, check: bool = True) -> Completed:
         """`podman exec`: a command inside."""
         return self.podman.run("exec", self.name, *command, timeout_s=timeout_s, check=check)
 
@@ -254,9 +254,9 @@ class Container:
 
     def stop(self, timeout_s: float = 5.0) -> Completed:
         """`podman stop`, with its own time until SIGKILL."""
-        return self.podman.run("stop", "--time", str(int(timeout_s)), self.name, timeout_s=timeout_s + 30)
+        return self.podman.run("stop", "--time", str(int(timeout_s)), self.name, timeout_s=timeout_s + 30 * SLOWNESS)
 
-    def wait(self, timeout_s: float = 30.0) -> int:
+    def wait(self, timeout_s: float = 30.0 * SLOWNESS) -> int:
         """Waits for the container's end; returns its exit status."""
         return int(self.podman.run("wait", self.name, timeout_s=timeout_s).stdout)
 
@@ -280,7 +280,7 @@ class ContainerFactory:
         options: Sequence[str] = (),
         image: str = BASE_IMAGE,
         name: str | None = None,
-        timeout_s: float = 60.0,
+        timeout_s: float = 60.0 * SLOWNESS,
     ) -> Container:
         """`podman run -d OPTIONS --label ... IMAGE COMMAND`.  Raises CommandFailed when it does not start."""
         name = name or f"{self.prefix}-{next(self._numbers)}"
@@ -324,7 +324,7 @@ class Sidecar:
 
     podman: Podman
 
-    def avckpt(self, *args: str, timeout_s: float = 30.0, check: bool = True) -> Completed:
+    def avckpt(self, *args: str, timeout_s: float = 30.0 * SLOWNESS, check: bool = True) -> Completed:
         """`avckpt ARGS` on the host."""
         return run([*avckpt_command(), *args], timeout_s=timeout_s, check=check)
 
@@ -341,18 +341,26 @@ class Sidecar:
         """What `avckpt ps` says of one container; None: it does not know it."""
         return next((entry for entry in self.ps() if entry["id"] == container.id), None)
 
-    def wait_generation(self, container: Container, at_least: int = 1, timeout_s: float = 20.0) -> dict[str, Any]:
+    def wait_generation(
+        self, container: Container, at_least: int = 1, timeout_s: float = 20.0 * SLOWNESS
+    ) -> dict[str, Any]:
         """Waits until generation number `at_least` was taken; returns the container's entry of `avckpt ps`."""
         return self.wait_for(
             container, lambda entry: entry["generation"] >= at_least, f"generation {at_least}", timeout_s
         )
 
-    def wait_restores(self, container: Container, at_least: int = 1, timeout_s: float = 20.0) -> dict[str, Any]:
+    def wait_restores(
+        self, container: Container, at_least: int = 1, timeout_s: float = 20.0 * SLOWNESS
+    ) -> dict[str, Any]:
         """Waits until the container was restored `at_least` times."""
         return self.wait_for(container, lambda entry: entry["restores"] >= at_least, f"restore {at_least}", timeout_s)
 
     def wait_for(
-        self, container: Container, condition: Callable[[dict[str, Any]], bool], what: str, timeout_s: float = 20.0
+        self,
+        container: Container,
+        condition: Callable[[dict[str, Any]], bool],
+        what: str,
+        timeout_s: float = 20.0 * SLOWNESS,
     ) -> dict[str, Any]:
         """Waits until `avckpt ps` has an entry that fits."""
         last: dict[str, Any] | None = None

@@ -154,7 +154,7 @@ class Load:
             path = rng.choice(list(self.paths))
             try:
                 if connection is None:
-                    connection = http.client.HTTPConnection(self.host, self.port, timeout=5)
+                    connection = http.client.HTTPConnection(self.host, self.port, timeout=5 * SLOWNESS)
                 connection.request("GET", path)
                 response = connection.getresponse()
                 body = response.read()

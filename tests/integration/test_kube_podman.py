@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from testkit.harness import BASE_IMAGE, Container, ContainerFactory, Podman, Sidecar, avckpt_command, run
+from testkit.harness import BASE_IMAGE, SLOWNESS, Container, ContainerFactory, Podman, Sidecar, avckpt_command, run
 
 POD = f"""
 apiVersion: v1
@@ -37,11 +37,11 @@ def play(podman: Podman, tmp_path: Path) -> Iterator[Callable[[str], None]]:
         path = tmp_path / f"{len(played)}.yaml"
         path.write_text(text)
         played.append(str(path))
-        podman.run("kube", "play", str(path), timeout_s=120)
+        podman.run("kube", "play", str(path), timeout_s=120 * SLOWNESS)
 
     yield start
     for path in played:
-        podman.run("kube", "down", path, timeout_s=120, shielded=True)
+        podman.run("kube", "down", path, timeout_s=120 * SLOWNESS, shielded=True)
 
 
 def found(podman: Podman, name: str) -> Container:

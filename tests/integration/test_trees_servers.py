@@ -13,7 +13,7 @@ import pytest
 
 from testkit.harness import ContainerFactory, Sidecar, wait_until
 from testkit.procfs import figures
-from testkit.trees import LONG, Load, Tree, start_tree, write_files
+from testkit.trees import LONG, RESTORE_S, Load, Tree, start_tree, write_files
 
 pytestmark = pytest.mark.shared_machine(
     "init waits two seconds for its guard, which may get no CPU for as long; clients have time limits of their own"
@@ -101,7 +101,7 @@ def test_restored_whole_under_load(server: str, sidecar: Sidecar, container: Con
     """The same processes with the same PIDs; every answer is right, and answers keep coming."""
     tree = SERVERS[server](sidecar, container, tmp_path)
     rng = random.Random(server)
-    wait_until(lambda: len(workers(tree)) == 4, 30, "four workers")
+    wait_until(lambda: len(workers(tree)) == 4, RESTORE_S, "four workers")
     before = tree.places()
     with Load(tree.container.ip, 8000, paths_of(server)) as load:
         for _ in range(KILLS):
@@ -119,14 +119,14 @@ def test_a_killed_worker_is_its_masters_business(
 ) -> None:
     """The master replaces it, nothing is restored, and checkpoints are taken as before."""
     tree = SERVERS[server](sidecar, container, tmp_path)
-    wait_until(lambda: len(workers(tree)) == 4, 30, "four workers")
+    wait_until(lambda: len(workers(tree)) == 4, RESTORE_S, "four workers")
     with Load(tree.container.ip, 8000, paths_of(server)) as load:
         for _ in range(3):
             victim = workers(tree)[0]
             os.kill(victim, signal.SIGKILL)
             wait_until(
                 lambda gone=victim: gone not in workers(tree) and len(workers(tree)) == 4,  # type: ignore[misc]
-                30,
+                RESTORE_S,
                 "a new worker",
             )
             load.wait_answers(50)
@@ -143,7 +143,7 @@ def test_workers_share_their_memory_after_a_restore(
 ) -> None:
     """gunicorn --preload: workers inherit 25 MB of data from their master."""
     tree = gunicorn(sidecar, container, tmp_path)
-    wait_until(lambda: len(workers(tree)) == 4, 30, "four workers")
+    wait_until(lambda: len(workers(tree)) == 4, RESTORE_S, "four workers")
     tree.next_generation()
     before = sum(figures(member.pid)["Pss"] for member in tree.members())
     tree.kill()
