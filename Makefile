@@ -94,7 +94,7 @@ test-kernels: ## the engine's tests on other kernels, in emulated machines (KERN
 
 test-machine: setup ## demo, hooks, Quadlet, trees, packages on Debian 13 (Podman 5.4, systemd, cgroup v2), in an emulated machine
 	@AVCKPT_MACHINE=trixie scripts/setup-machine.sh trixie
-	@AVCKPT_MACHINE=trixie scripts/test-machine.sh trixie $(MACHINE_TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)")
+	@CPUS=$${CPUS:-1} AVCKPT_MACHINE=trixie scripts/test-machine.sh trixie $(MACHINE_TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)")
 
 test-aarch64: build-aarch64 ## the engine's tests on Debian 12 for aarch64, in an emulated machine (CPU_MODEL=max: with SVE, MTE)
 	@CPU_MODEL=$(CPU_MODEL) scripts/test-aarch64.sh $(AARCH64_TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)")

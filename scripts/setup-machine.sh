@@ -23,8 +23,8 @@ PACKAGES=$PACKAGES,gcc,g++,libc6-dev,binutils,make,git,python3,python3-venv,pyth
 PACKAGES=$PACKAGES,strace,gdb,psmisc,cyclonedds-dev,cyclonedds-tools
 case $SUITE in
 bookworm) ;;
-# Shells, for the completion of commands.
-trixie) PACKAGES=$PACKAGES,zsh,fish,bash-completion ;;
+# Shells, for the completion of commands; with AppArmor's parser Podman confines every container.
+trixie) PACKAGES=$PACKAGES,zsh,fish,bash-completion,apparmor ;;
 *) echo "AVCKPT_MACHINE is bookworm or trixie, not $SUITE" >&2 && exit 1 ;;
 esac
 
@@ -73,7 +73,9 @@ unpack_world() {
 	printf '/dev/vda / ext4 rw,relatime 0 0\n/dev/vdb /opt/avckpt ext4 rw,relatime 0 0\n' >"$WORLD/etc/fstab" || return
 	mkdir -p "$WORLD/opt/avckpt" || return
 	echo machine >"$WORLD/etc/hostname" || return
-	chroot "$WORLD" systemctl -q mask apt-daily.timer apt-daily-upgrade.timer systemd-networkd-wait-online.service || return
+	# AppArmor's service would compile the profiles of a hundred programs, for minutes; Podman loads its own.
+	chroot "$WORLD" systemctl -q mask apt-daily.timer apt-daily-upgrade.timer systemd-networkd-wait-online.service \
+		apparmor.service || return
 	# The network, for what has to be fetched inside: QEMU's own, by DHCP.
 	printf '[Match]\nName=en*\n[Network]\nDHCP=yes\n' >"$WORLD/etc/systemd/network/10-machine.network" || return
 	chroot "$WORLD" systemctl -q enable systemd-networkd.service || return
