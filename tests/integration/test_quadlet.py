@@ -33,12 +33,19 @@ pytestmark = [
 APP = """
 import os, socket, time
 
-with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
-    ready.sendto(b"READY=1", os.environ["NOTIFY_SOCKET"])
+systemd = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+systemd.connect(os.environ["NOTIFY_SOCKET"])
+systemd.send(b"READY=1")
 n = 0
 while True:
     n += 1
     print("counted", n, flush=True)
+    systemd.send(b"WATCHDOG=1")
+    with open("/dev/shm/beat", "w") as beat:
+        beat.write(str(n))
+    if os.path.exists("/app/hang"):
+        print("hangs", flush=True)
+        time.sleep(1e6)
     time.sleep(0.2)
 """
 
@@ -54,12 +61,23 @@ Notify=true
 Label=avckpt.enable=true
 Label=avckpt.interval=300ms
 Label=avckpt.restore.max={most}/1h
+{container}
 
 [Service]
 Restart=always
 RestartSec=1
 TimeoutStartSec=300
+{service}
 """
+
+CHECKED = f"""
+Label=avckpt.restore.on=signal,exit,unhealthy
+HealthCmd=find /dev/shm/beat -newermt "-{2 * SLOWNESS:g} seconds" | grep . >>/dev/shm/passed
+HealthInterval={SLOWNESS:g}s
+HealthTimeout=60s
+HealthRetries=2
+"""
+"""Podman and the sidecar both run it; it notices within five intervals that there are no signs of life."""
 
 
 def systemctl(*args: str) -> str:
@@ -113,9 +131,13 @@ def service(sidecar_unit: Sidecar, podman: Podman, tmp_path: Path) -> Iterator[C
     UNITS.mkdir(parents=True, exist_ok=True)
     made: list[Service] = []
 
-    def start(most: int = KILLS + 1) -> Service:
+    def start(most: int = KILLS + 1, container: str = "", watchdog_s: float = 0) -> Service:
         name = f"avckpt-quadlet-{os.getpid()}-{next(NUMBERS)}"
-        (UNITS / f"{name}.container").write_text(UNIT.format(name=name, folder=tmp_path, most=most))
+        (UNITS / f"{name}.container").write_text(
+            UNIT.format(
+                name=name, folder=tmp_path, most=most, container=container, service=f"WatchdogSec={watchdog_s:g}"
+            )
+        )
         made.append(Service(podman, name, ""))
         systemctl("daemon-reload")
         systemctl("start", f"{name}.service")
@@ -178,6 +200,47 @@ def test_systemd_restarts_what_is_not_undone(service: Callable[..., Service], si
     one.id = one.inspect()["Id"]
     assert one.id != first
     sidecar_unit.wait_generation(one, 1, PATIENCE_S)
+
+
+def hang(service: Service, folder: Path) -> None:
+    """The application stops giving signs of life; one that goes back to a checkpoint does not do it again."""
+    (folder / "hang").touch()
+    wait_until(lambda: "hangs" in journal(service.unit).splitlines(), PATIENCE_S, "it hangs", every_s=0.2)
+    (folder / "hang").unlink()
+
+
+def test_what_hangs_is_back_before_systemds_watchdog(
+    service: Callable[..., Service], sidecar_unit: Sidecar, tmp_path: Path
+) -> None:
+    """`WatchdogSec=` is for what the health check leaves; signs of life after a restore count."""
+    one = service(container=CHECKED, watchdog_s=30 * SLOWNESS)
+    main = one.shown("MainPID")
+    passed = Path(f"/proc/{one.pid}/root/dev/shm/passed")
+    wait_until(lambda: passed.exists() and passed.read_text().count("\n") > 5, PATIENCE_S, "it is healthy", every_s=0.5)
+    hang(one, tmp_path)
+    sidecar_unit.wait_restores(one, 1, 2 * PATIENCE_S)
+    last = int(one.shown("WatchdogTimestampMonotonic"))
+    wait_until(
+        lambda: int(one.shown("WatchdogTimestampMonotonic")) > last, PATIENCE_S, "another sign of life", every_s=0.5
+    )
+    assert (one.shown("NRestarts"), one.shown("MainPID")) == ("0", main)
+
+
+def test_systemds_watchdog_restarts_what_nobody_else_notices(
+    service: Callable[..., Service], sidecar_unit: Sidecar, tmp_path: Path
+) -> None:
+    """It kills conmon, and then everything of the unit at once; that is the container's end, and no crash."""
+    one = service(watchdog_s=4 * SLOWNESS)
+    first = one.id
+    sidecar_unit.wait_generation(one, 1, PATIENCE_S)
+    hang(one, tmp_path)
+    wait_until(lambda: one.shown("NRestarts") == "1", 2 * PATIENCE_S, "systemd starts it once more", every_s=0.5)
+    wait_until(lambda: one.shown("ActiveState") == "active", PATIENCE_S, "it is ready", every_s=0.5)
+    one.id = one.inspect()["Id"]
+    assert one.id != first
+    sidecar_unit.wait_generation(one, 1, PATIENCE_S)
+    assert [row["id"] for row in sidecar_unit.ps()] == [one.id]
+    assert "restored in" not in journal(one.unit, "--identifier=avckpt")
 
 
 def test_stopping_a_unit_is_no_crash(service: Callable[..., Service], sidecar_unit: Sidecar) -> None:
