@@ -37,6 +37,9 @@ OURS = "io.github.avckpt.test"
 DROP_IN = Path("/etc/containers/containers.conf.d/50-avckpt.conf")
 RUN_DIR = Path(os.environ.get("AVCKPT_RUN_DIR") or "/run/avckpt")
 CONFIG_DIR = Path("/etc/avckpt")
+CONFIG = CONFIG_DIR / "config.yaml"
+OF_A_TEST = "# of a test: what a killed run has left is removed by the next\n"
+"""First line of each that a test writes."""
 LOCK = Path("/run/lock/avckpt-tests.lock")
 
 SLOWNESS = float(os.environ.get("AVCKPT_SLOWNESS", "1"))
@@ -503,6 +506,8 @@ def running_sidecar(podman: Podman) -> Iterator[Sidecar]:
         if OURS not in (podman.inspect(SIDECAR_NAME)["Config"]["Labels"] or {}):
             raise RuntimeError(f"a container {SIDECAR_NAME} that is not the tests' own is here: stop it first")
         sidecar.stop()  # left by a run that was killed
+    if CONFIG.exists() and CONFIG.read_text().startswith(OF_A_TEST):
+        CONFIG.unlink()
     with hooks_installed():
         try:
             sidecar.start()

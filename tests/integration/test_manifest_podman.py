@@ -19,7 +19,8 @@ from avckpt.cli.install import LIBEXEC
 
 from testkit.harness import (
     BASE_IMAGE,
-    CONFIG_DIR,
+    CONFIG,
+    OF_A_TEST,
     ROOT,
     Completed,
     Container,
@@ -324,13 +325,12 @@ def test_hooks_of_another_build_are_said_and_brought_up_to_date(project: Project
 
 
 def test_the_sidecar_is_started_and_reads_the_machines_configuration(project: Project, sidecar: Sidecar) -> None:
-    config = CONFIG_DIR / "config.yaml"
-    if config.exists():
-        pytest.skip(f"{config} is in use on this machine")
+    if CONFIG.exists():
+        pytest.skip(f"{CONFIG} is in use on this machine")
     project.write(SERVICES.replace(", avckpt.interval: 100ms", ""))
     sidecar.stop()
     try:
-        config.write_text(f"names:\n  {project.name}*:\n    interval: 300ms\n    keep: 3\n")
+        CONFIG.write_text(f"{OF_A_TEST}names:\n  {project.name}*:\n    interval: 300ms\n    keep: 3\n")
         done = project.avckpt("up", "--json")
         assert "starting the container avckpt-sidecar" in done.stderr
         assert states(done)["by-map"]
@@ -342,17 +342,17 @@ def test_the_sidecar_is_started_and_reads_the_machines_configuration(project: Pr
         assert entries["by-list"]["keep"] == 3
         # Stopped, not removed: it is started again, and adopts.
         project.podman.run("stop", "--time", "5", "avckpt-sidecar")
-        config.write_text("defaults:\n  keep: few\n")
+        CONFIG.write_text(f"{OF_A_TEST}defaults:\n  keep: few\n")
         said = project.avckpt("up").stderr
         assert "again" in said
-        assert "warning: the sidecar goes by older or built-in defaults: /etc/avckpt/config.yaml:2: " in said
+        assert "warning: the sidecar goes by older or built-in defaults: /etc/avckpt/config.yaml:3: " in said
         [by_map] = [entry for entry in sidecar.ps() if entry["name"].startswith(f"{project.name}_by-map")]
         assert by_map["automatic"]
-        config.write_text("defaults:\n  keep: 5\n")
+        CONFIG.write_text(f"{OF_A_TEST}defaults:\n  keep: 5\n")
         project.podman.run("kill", "--signal", "HUP", "avckpt-sidecar")
         wait_until(lambda: "config.yaml was read" in sidecar.logs(), 5, "the sidecar has read it")
     finally:
-        config.unlink(missing_ok=True)
+        CONFIG.unlink(missing_ok=True)
         sidecar.restart()
 
 

@@ -15,7 +15,7 @@ from avckpt.cli import doctor, sidecar_container
 from avckpt.cli.client import Client
 from avckpt.errors import SidecarUnreachable
 
-from testkit.harness import CONFIG_DIR, RUN_DIR, SIDECAR_IMAGE, SIDECAR_NAME, take_checkpoint, wait_until
+from testkit.harness import CONFIG, RUN_DIR, SIDECAR_IMAGE, SIDECAR_NAME, take_checkpoint, wait_until
 from testkit.protected import told
 
 pytestmark = pytest.mark.shared_machine(
@@ -212,8 +212,8 @@ def test_the_command_line_in_its_container(container: ContainerFactory, sidecar:
     assert sidecar.wait_restores(web)["state"] == "protected"
     events = [json.loads(line) for line in inside("events", "--json", "--since", "1h").stdout.splitlines()]
     assert "restored" in {event["kind"] for event in events if event["id"] == web.id}
-    assert f"{CONFIG_DIR}/config.yaml" in inside("reload").stdout
-    assert inside("check", "--config").stdout == f"no {CONFIG_DIR}/config.yaml: the built-in defaults hold\n"
+    assert str(CONFIG) in inside("reload").stdout
+    assert inside("check", "--config").stdout == f"no {CONFIG}: the built-in defaults hold\n"
     assert "_AVCKPT_COMPLETE" in inside("completion", "bash").stdout
     doctor = inside("doctor")
     assert "run avckpt doctor on the host too" in doctor.stdout
