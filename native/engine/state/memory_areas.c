@@ -60,9 +60,14 @@ static uint64_t hash(uint64_t h, uint64_t value)
 	return h ^ h >> 29;
 }
 
-static bool is_of_parasite(const struct process *process, avc_remote at)
+/* That of a guard that has died is forgotten when it is unmapped, and a template may still have it: it is
+ * no shared memory of the application's. */
+static bool is_of_parasite(const struct process *process, const struct mapping *m)
 {
-	if (parasite_contains(&process->parasite, at))
+	const avc_remote at = m->start;
+
+	if (parasite_contains(&process->parasite, at) ||
+	    !strcmp(m->name, "/memfd:" PARASITE_NAME " (deleted)"))
 		return true;
 	for (uint32_t i = 0; i < process->old_parasites; i++)
 		if (at - process->old_parasite[i].base < process->old_parasite[i].bytes)
@@ -222,7 +227,7 @@ static int find_area(const struct mapping *m, void *arg)
 	hash_mapping(m, arg);
 	survey->unforked |= survey->recycled && m->flags & MAPPING_DONTFORK &&
 			    m->start < ARCH_USER_END;
-	if (!is_of_parasite(survey->process, m->start)) {
+	if (!is_of_parasite(survey->process, m)) {
 		marks_add(&survey->memory->kinds, m, kind_of(survey, m));
 		survey->memory->special |= mapping_is_special(m);
 		survey->memory->grows |= m->flags & MAPPING_GROWING &&
@@ -235,7 +240,7 @@ static int find_area(const struct mapping *m, void *arg)
 		survey->refused = memory_refuses(m);
 	segment = !wiped && mapping_is_segment(m);
 	named = segment || (!wiped && has_name(m) && is_memory(survey, m));
-	if ((!wiped && !is_shared(m) && !named) || is_of_parasite(survey->process, m->start))
+	if ((!wiped && !is_shared(m) && !named) || is_of_parasite(survey->process, m))
 		return 0;
 	if (survey->areas.count == AREAS_MAX) {
 		survey->too_many = true;
