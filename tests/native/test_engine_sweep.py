@@ -22,7 +22,6 @@ from typing import Any
 import pytest
 from avckpt.guard import Images
 
-from testkit.cgroups import throttle
 from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config
 from testkit.harness import ROOT, wait_until
 from testkit.procfs import below, state_of, status_of
@@ -98,10 +97,6 @@ def answer(guard: GuardProcess, death: Death, nth: int, command: str) -> dict[st
         death.disarm()
 
 
-SHARES_S = 0.5
-"""Longer than a guard waits for the end of one that shares its descriptor table."""
-BRINGING = 200
-"""Calls of a guard until its parasite is in the application, by a process that shares the descriptor table."""
 BARREN = "under barren steady"
 """Its filter refuses what injected code calls without its guard."""
 VICTIMS = ("steady", "steady --in-child", "peeker", "peeker --in-child", "signals 3", BARREN, CELLS)
@@ -213,32 +208,6 @@ def protects(guard: GuardProcess) -> None:
     wait_until(taken, PATIENCE_S, "the next guard takes a checkpoint", 0.05)
     for missed in answers[:-1]:  # or it had no CPU
         assert missed["kind"] == "missed", missed
-
-
-@pytest.mark.parametrize("death", ["calls"], indirect=True)
-def test_starved(tmp_path: Path, death: Death) -> None:
-    """What the guard leaves behind ends by itself, but gets no CPU to do so: it is no process of the application's."""
-    with (
-        throttle() as slow,
-        Victim("busy 4", tmp_path) as victim,
-        GuardProcess(config(freeze_deadline_s=PATIENCE_S), [victim.pid]) as guard,
-    ):
-        guard.wait("attached")
-        slow.take(victim.app)
-        for nth in numbers(16):
-            slow.wait()
-            kind = answer(guard, death, nth, "checkpoint")["kind"]
-            if kind == "guard_lost":
-                guard.start_another(victim.pid)
-                end = time.monotonic() + SHARES_S
-                while time.monotonic() < end:
-                    told = guard.command("checkpoint")
-                    assert told["kind"] in ("checkpoint", "missed"), (nth, told)
-            slow.go()
-            protects(guard)
-            if kind == "checkpoint" or nth > BRINGING:
-                return
-            guard.start_another(victim.pid)
 
 
 def wait_goes_on_or_ends(victim: Victim) -> None:

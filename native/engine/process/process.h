@@ -47,7 +47,7 @@ struct tree {
 	uint32_t made_count;
 	/* One that shares its descriptor table or directory with another: refused if it stays. */
 	pid_t sharer;
-	uint64_t sharer_since_ns, sharer_ran_ns;
+	uint64_t sharer_since_ns;
 	/* Whether this child of init is one of our own. */
 	bool (*is_ours)(pid_t pid, const void *arg);
 	const void *arg;

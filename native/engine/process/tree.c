@@ -276,23 +276,11 @@ static int look_at(const struct tree *tree, pid_t pid, struct proc_stat *stat)
 	return proc_stat(pid, stat);
 }
 
-/* It would go on to its end, and has got no CPU for that since the last look. */
-static bool waits_for_cpu(struct tree *tree, pid_t pid)
-{
-	const uint64_t before = tree->sharer_ran_ns;
-	struct proc_stat stat;
-
-	tree->sharer_ran_ns = proc_cpu_ns(pid);
-	return tree->sharer_ran_ns == before && proc_stat(pid, &stat) == 0 && stat.state == 'R';
-}
-
 /* It shares with another one for so short a time that a guard may have left it behind when it died
- * just now, as a porter or clone.  Time in which it only waits for a CPU does not count. */
+ * just now, as a porter or clone. */
 static bool may_be_left(struct tree *tree, pid_t pid)
 {
-	const bool waits = waits_for_cpu(tree, pid);
-
-	if (tree->sharer != pid || waits) {
+	if (tree->sharer != pid) {
 		tree->sharer = pid;
 		tree->sharer_since_ns = now_ns();
 	}
