@@ -105,16 +105,16 @@ static void note_flight(int fd, const struct statx *st, struct file *file)
 }
 
 /* Not in a freeze: it may block. */
-static uint64_t mark_of(int fd, struct file *file)
+static void note_rights(int fd, struct file *file)
 {
 	struct statx st = { 0 };
-	const bool known = fd_look(fd, STATX_TYPE | STATX_INO, &st);
+	uint64_t mark = RIGHTS_UNKNOWN;
 
+	if (fd_look(fd, STATX_TYPE | STATX_INO, &st))
+		mark = st.stx_ino * 31 + st.stx_dev_minor * 7919 + st.stx_dev_major +
+		       ((uint64_t)st.stx_mode << 48) + ((uint64_t)st.stx_rdev_minor << 32);
 	note_flight(fd, &st, file);
-	if (!known)
-		return RIGHTS_UNKNOWN;
-	return st.stx_ino * 31 + st.stx_dev_minor * 7919 + st.stx_dev_major +
-	       ((uint64_t)st.stx_mode << 48) + ((uint64_t)st.stx_rdev_minor << 32);
+	file->rights = file->rights * 1099511628211u + mark + 1;
 }
 
 static void land(const struct cmsghdr *c, bool rights, struct file *file)
@@ -127,7 +127,7 @@ static void land(const struct cmsghdr *c, bool rights, struct file *file)
 		memcpy(&fd, CMSG_DATA(c) + i * sizeof fd, sizeof fd);
 		landing->fd[landing->count++] = fd;
 		if (rights)
-			file->rights = file->rights * 1099511628211u + mark_of(fd, file) + 1;
+			note_rights(fd, file);
 	}
 }
 

@@ -95,8 +95,7 @@ struct survey {
 /* Of an existing parasite, or one that was being injected (bring_parasite). */
 static bool is_of_parasite(const struct mapping *m)
 {
-	return !strcmp(m->name, "/memfd:" PARASITE_NAME " (deleted)") ||
-	       !strcmp(m->name, "/dev/zero (deleted)");
+	return !strcmp(m->name, PARASITE_MAPPED) || !strcmp(m->name, "/dev/zero (deleted)");
 }
 
 /* In a stub that is there already a task may still be, or a handler may return to it: a thread that

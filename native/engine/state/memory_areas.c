@@ -66,8 +66,7 @@ static bool is_of_parasite(const struct process *process, const struct mapping *
 {
 	const avc_remote at = m->start;
 
-	if (parasite_contains(&process->parasite, at) ||
-	    !strcmp(m->name, "/memfd:" PARASITE_NAME " (deleted)"))
+	if (parasite_contains(&process->parasite, at) || !strcmp(m->name, PARASITE_MAPPED))
 		return true;
 	for (uint32_t i = 0; i < process->old_parasites; i++)
 		if (at - process->old_parasite[i].base < process->old_parasite[i].bytes)
@@ -222,12 +221,13 @@ static int find_area(const struct mapping *m, void *arg)
 	 * should be: no random data is repeated. */
 	const bool wiped = (m->flags & (MAPPING_WIPEONFORK | MAPPING_DROPPABLE)) ==
 			   MAPPING_WIPEONFORK;
+	const bool ours = is_of_parasite(survey->process, m);
 	bool segment, named;
 
 	hash_mapping(m, arg);
 	survey->unforked |= survey->recycled && m->flags & MAPPING_DONTFORK &&
 			    m->start < ARCH_USER_END;
-	if (!is_of_parasite(survey->process, m)) {
+	if (!ours) {
 		marks_add(&survey->memory->kinds, m, kind_of(survey, m));
 		survey->memory->special |= mapping_is_special(m);
 		survey->memory->grows |= m->flags & MAPPING_GROWING &&
@@ -240,7 +240,7 @@ static int find_area(const struct mapping *m, void *arg)
 		survey->refused = memory_refuses(m);
 	segment = !wiped && mapping_is_segment(m);
 	named = segment || (!wiped && has_name(m) && is_memory(survey, m));
-	if ((!wiped && !is_shared(m) && !named) || is_of_parasite(survey->process, m))
+	if ((!wiped && !is_shared(m) && !named) || ours)
 		return 0;
 	if (survey->areas.count == AREAS_MAX) {
 		survey->too_many = true;

@@ -168,6 +168,7 @@ struct parasite {
 	int code_fd, data_fd;
 };
 #define PARASITE_NAME "avckpt-parasite"
+#define PARASITE_MAPPED "/memfd:" PARASITE_NAME " (deleted)"
 /* How it is mapped in two parts. */
 #define PARASITE_CODE_PROT (PROT_READ | PROT_EXEC)
 #define PARASITE_DATA_PROT (PROT_READ | PROT_WRITE)

@@ -146,7 +146,7 @@ def down(
     compose = Compose(paths, project, profiles=profiles, env_file=env_file)
     before = compose.containers() if as_json else []
     compose.down(services, volumes, _say)
-    staying = compose.containers()
+    staying = compose.containers() if as_json or not services else []
     if staying and not services:
         names = ", ".join(sorted(one.name for one in staying))
         _say(f"{names}: of another manifest of this project; stays, with the project's pod and networks")

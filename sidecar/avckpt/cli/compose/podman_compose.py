@@ -72,7 +72,7 @@ class Compose:
     def __init__(
         self, files: Sequence[Path], project: str = "", *, profiles: Sequence[str] = (), env_file: Path | None = None
     ) -> None:
-        self._called = " ".join(map(str, files))
+        self._files = " ".join(map(str, files))
         self._command = [sys.executable, "-m", "podman_compose"]
         for path in files:
             self._command += ["-f", str(path)]
@@ -144,7 +144,7 @@ class Compose:
     def _failed(self, command: str, why: str) -> AvckptError:
         """An exception of its own is about the files, and it does not say which."""
         exception = _EXCEPTION.match(why)
-        where = f"{self._called}: " if exception else ""
+        where = f"{self._files}: " if exception else ""
         return AvckptError(f"{where}{command} failed: {why[exception.end() :] if exception else why}")
 
 
