@@ -133,8 +133,16 @@ def test_a_container_that_is_killed_whole_is_forgotten(local: LocalSidecar) -> N
     local.wait_for(web, state="ended")
     # Nothing of ours keeps what it held: no guard, no pidfd.
     assert local.process is not None
-    pidfds = [fd.readlink() for fd in Path(f"/proc/{local.process.pid}/fd").iterdir()]
-    assert not [fd for fd in pidfds if "pidfd" in str(fd)]
+    descriptors = Path(f"/proc/{local.process.pid}/fd")
+
+    def has_pidfd() -> bool:
+        for descriptor in descriptors.iterdir():
+            with contextlib.suppress(FileNotFoundError):  # closed since
+                if "pidfd" in str(descriptor.readlink()):
+                    return True
+        return False
+
+    wait_until(lambda: not has_pidfd(), 10, "it has no pidfd")
 
 
 @SHARED

@@ -448,6 +448,21 @@ def test_sockets_made_again(scenario: str, where: str, tmp_path: Path) -> None:
                     assert "error" not in event, event
 
 
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("scenario", ["connecting", "connecting-closed"])
+def test_a_connect_that_waits_is_begun_anew(scenario: str, where: str, tmp_path: Path) -> None:
+    """With the same options, whether its socket was connected since, or closed as well."""
+    with (
+        Victim(f"listeners {scenario} {tmp_path} {where}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        checkpoint(guard)
+        disturb(victim)
+        for _ in range(2):
+            event = restored(victim, guard)
+            assert "error" not in event, event
+
+
 def test_a_socket_that_is_just_being_bound(tmp_path: Path) -> None:
     """It has a name after the restore if and only if bind(2) had returned at the checkpoint."""
     with (

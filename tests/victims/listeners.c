@@ -8,6 +8,7 @@
 #include <netinet/in.h>
 #include <netinet/tcp.h>
 #include <pthread.h>
+#include <stdatomic.h>
 #include <stddef.h>
 #include <sys/epoll.h>
 #include <sys/fsuid.h>
@@ -357,7 +358,7 @@ static void deserted_setup(void)
 	const pid_t parent = getpid();
 	struct stat st;
 
-	fd[0] = listen_inet(0, SOCK_NONBLOCK, 0);
+	fd[0] = listen_inet(0, SOCK_NONBLOCK, 1);
 	fd[1] = make_file("shared", "", O_RDWR);
 	must(unlink(path_of("shared")) == 0 && fstat(fd[1], &st) == 0, "unlink");
 	shared_ino = st.st_ino;
@@ -759,6 +760,76 @@ static void options_verify(void)
 	expect_option(UDP, SO_BINDTODEVICE, "lo", 3);
 }
 
+/* ---- a connect(2) that waits for its server ------------------------------------------------ */
+
+static atomic_bool connected;
+
+static void *connect_and_wait(void *arg)
+{
+	must(!connect(fd[1], (struct sockaddr *)&name[0], name_bytes[0]), "connect");
+	connected = true;
+	for (;;)
+		pause();
+	return arg;
+}
+
+static bool is_connecting(void)
+{
+	struct tcp_info info = { 0 };
+	socklen_t bytes = sizeof info;
+
+	return !getsockopt(fd[1], IPPROTO_TCP, TCP_INFO, &info, &bytes) &&
+	       info.tcpi_state == TCP_SYN_SENT;
+}
+
+/* The server's queue is full: one that waits to be accepted, and one more whose SYN is not answered. */
+static void connecting_setup(void)
+{
+	const struct timeval time = { 30, 0 };
+	pthread_t thread;
+
+	fd[0] = listen_inet(0, SOCK_NONBLOCK, 1);
+	must(!listen(fd[0], 0), "listen");
+	remember_name(0);
+	for (int i = 2; i < 4; i++) {
+		fd[i] = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK, 0);
+		must(!connect(fd[i], (struct sockaddr *)&name[0], name_bytes[0]) ||
+			     errno == EINPROGRESS,
+		     "connect");
+	}
+	fd[1] = socket(AF_INET, SOCK_STREAM, 0);
+	must(!setsockopt(fd[1], SOL_SOCKET, SO_SNDTIMEO, &time, sizeof time) &&
+		     !pthread_create(&thread, NULL, connect_and_wait, NULL),
+	     "pthread_create");
+	while (!is_connecting())
+		usleep(1000);
+}
+
+/* With the next of its SYNs. */
+static void accept_until_connected(void)
+{
+	for (; !connected; usleep(1000))
+		(void)!accept(fd[0], NULL, NULL);
+}
+
+static void closed_disturb(void)
+{
+	accept_until_connected();
+	close(fd[1]);
+}
+
+static void connecting_verify(void)
+{
+	const struct timeval time = { 30, 0 };
+	struct sockaddr_storage server;
+	socklen_t bytes = sizeof server;
+
+	accept_until_connected();
+	CHECK(!getpeername(fd[1], (struct sockaddr *)&server, &bytes), "not connected: %s",
+	      strerror(errno));
+	expect_option(1, SO_SNDTIMEO, &time, sizeof time);
+}
+
 static const struct scenario scenarios[] = {
 	{ "unix", unix_setup, unix_disturb, unix_verify },
 	{ "dropped", dropped_setup, dropped_disturb, dropped_verify },
@@ -770,6 +841,8 @@ static const struct scenario scenarios[] = {
 	{ "rebound", rebound_setup, rebound_disturb, rebound_verify },
 	{ "early", early_setup, early_disturb, early_verify },
 	{ "brief", brief_setup, nothing, nothing },
+	{ "connecting", connecting_setup, accept_until_connected, connecting_verify },
+	{ "connecting-closed", connecting_setup, closed_disturb, connecting_verify },
 	{ "options", options_setup, options_disturb, options_verify },
 };
 

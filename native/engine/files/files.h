@@ -224,7 +224,9 @@ struct file_socket {
 	uint32_t others; /* other tables that have it */
 	int domain, type, protocol;
 	bool listening, connected;
-	bool idle;    /* has never been connected, and does not listen                    */
+	bool idle; /* has never been connected, and does not listen                    */
+	/* Of TCP, by a connect(2) that blocks: a restored process repeats that                     */
+	bool connecting;
 	int backlog;  /* -1: not read yet */
 	uint8_t shut; /* of a pair's end: SHUT_IN, SHUT_OUT                          */
 	/* For those that can be recreated: file_socket_is_alone() */
@@ -501,6 +503,8 @@ void file_look_at_options(int fd, struct file_socket *socket, pid_t init);
 bool file_socket_has_options(const struct file_socket *socket);
 /* Whether one that was idle has got a name or a connection since. */
 bool file_socket_was_used(int fd, const struct file_socket *socket);
+/* Whether a connect(2) of TCP is under way. */
+bool file_is_connecting(int fd, const struct file_socket *socket);
 /* Whether getsockname(2) says the same of `fd`. */
 bool file_socket_has_name(int fd, const struct file_socket *socket);
 /* Sets those that differ.  Returns NULL or what failed. */

@@ -220,6 +220,9 @@ static int bind_socket(int fd, const struct file_socket *s, const char **why)
 {
 	const int yes = 1;
 
+	/* Its port is of the kernel's choice, as a rule, and so is the next one. */
+	if (s->connecting)
+		return 0;
 	/* Connections that it had accepted still have its port. */
 	if (s->type == SOCK_STREAM)
 		setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);

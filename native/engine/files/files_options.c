@@ -246,7 +246,7 @@ void file_socket_free(struct file_socket *s)
 
 bool file_socket_is_alone(const struct file_socket *s)
 {
-	if (s->idle)
+	if (s->idle || s->connecting)
 		return true;
 	if (s->domain == AF_UNIX)
 		return file_unix_is_alone(s);

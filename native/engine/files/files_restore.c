@@ -144,6 +144,16 @@ static bool was_used(int fd, const struct file *w)
 	return file_socket_was_used(fd, w->socket);
 }
 
+static bool was_connecting(const struct file *w)
+{
+	return w->socket && w->socket->connecting;
+}
+
+static bool has_connected(int fd, const struct file *w)
+{
+	return !file_is_connecting(fd, w->socket);
+}
+
 static bool is_semaphore(const struct file *w)
 {
 	return w->kind == FILE_EVENTFD && w->semaphore;
@@ -169,6 +179,7 @@ static void give_up_useless(struct files_work *work)
 		{ has_the_last, was_read },
 		{ has_node, is_deleted },
 		{ was_idle, was_used },
+		{ was_connecting, has_connected },
 	};
 
 	for (uint32_t i = 0; i < work->want->count; i++) {

@@ -62,6 +62,16 @@ static bool is_idle(int fd, const struct file_socket *s)
 	return s->type == SOCK_DGRAM || state.revents & POLLHUP;
 }
 
+bool file_is_connecting(int fd, const struct file_socket *s)
+{
+	struct tcp_info info = { 0 };
+	socklen_t bytes = sizeof info;
+
+	return s->protocol == IPPROTO_TCP &&
+	       getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &bytes) == 0 &&
+	       info.tcpi_state == TCP_SYN_SENT;
+}
+
 /* net/can/af_can.c does not remember it: 0, if it cannot be told from another one. */
 static int can_protocol(int fd, int type)
 {
@@ -124,6 +134,8 @@ void file_look_at_socket(int fd, struct file *file)
 	if (s->listening && s->domain == AF_UNIX)
 		s->backlog = -1;
 	s->idle = is_idle(fd, s);
+	s->connecting = !s->idle && !s->connected && !s->listening && !(file->flags & O_NONBLOCK) &&
+			file_is_connecting(fd, s);
 	file_socket_free(file->socket);
 	file->socket = s;
 }
