@@ -449,9 +449,10 @@ def test_sockets_made_again(scenario: str, where: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-@pytest.mark.parametrize("scenario", ["connecting", "connecting-closed"])
-def test_a_connect_that_waits_is_begun_anew(scenario: str, where: str, tmp_path: Path) -> None:
-    """With the same options, whether its socket was connected since, or closed as well."""
+@pytest.mark.parametrize("scenario", ["connecting", "connecting-closed", "polled", "polled-closed"])
+def test_a_connect_under_way_comes_to_an_end(scenario: str, where: str, tmp_path: Path) -> None:
+    """Also if its socket was connected since, or closed.  One that blocks is begun anew, with the same options; one
+    that does not block ends with an error, or with a peer."""
     with (
         Victim(f"listeners {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,

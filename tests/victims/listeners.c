@@ -782,12 +782,9 @@ static bool is_connecting(void)
 	       info.tcpi_state == TCP_SYN_SENT;
 }
 
-/* The server's queue is full: one that waits to be accepted, and one more whose SYN is not answered. */
-static void connecting_setup(void)
+/* Of a server: one that waits to be accepted, and one more whose SYN is not answered. */
+static void fill_queue(void)
 {
-	const struct timeval time = { 30, 0 };
-	pthread_t thread;
-
 	fd[0] = listen_inet(0, SOCK_NONBLOCK, 1);
 	must(!listen(fd[0], 0), "listen");
 	remember_name(0);
@@ -797,6 +794,14 @@ static void connecting_setup(void)
 			     errno == EINPROGRESS,
 		     "connect");
 	}
+}
+
+static void connecting_setup(void)
+{
+	const struct timeval time = { 30, 0 };
+	pthread_t thread;
+
+	fill_queue();
 	fd[1] = socket(AF_INET, SOCK_STREAM, 0);
 	must(!setsockopt(fd[1], SOL_SOCKET, SO_SNDTIMEO, &time, sizeof time) &&
 		     !pthread_create(&thread, NULL, connect_and_wait, NULL),
@@ -830,6 +835,53 @@ static void connecting_verify(void)
 	expect_option(1, SO_SNDTIMEO, &time, sizeof time);
 }
 
+/* ---- the same without blocking ----------------------------------------------------------- */
+
+static void polled_setup(void)
+{
+	struct epoll_event event = { .events = EPOLLOUT | EPOLLIN | EPOLLET };
+
+	fill_queue();
+	fd[1] = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK, 0);
+	fd[5] = epoll_create1(0);
+	must(connect(fd[1], (struct sockaddr *)&name[0], name_bytes[0]) && errno == EINPROGRESS &&
+		     !epoll_ctl(fd[5], EPOLL_CTL_ADD, fd[1], &event),
+	     "connect");
+}
+
+/* As Go has it: with an error or a peer. */
+static bool has_ended(void)
+{
+	struct sockaddr_storage server;
+	socklen_t bytes = sizeof server, error_bytes = sizeof(int);
+	int error = 0;
+
+	must(!getsockopt(fd[1], SOL_SOCKET, SO_ERROR, &error, &error_bytes), "SO_ERROR");
+	return error || !getpeername(fd[1], (struct sockaddr *)&server, &bytes);
+}
+
+static void polled_disturb(void)
+{
+	struct epoll_event event;
+
+	do
+		(void)!accept(fd[0], NULL, NULL);
+	while (epoll_wait(fd[5], &event, 1, 1) == 0);
+	must(has_ended() && send(fd[1], "hello", 5, 0) == 5, "neither an error nor a peer");
+}
+
+static void polled_closed_disturb(void)
+{
+	close(fd[1]);
+}
+
+static void polled_verify(void)
+{
+	struct epoll_event event;
+
+	CHECK(epoll_wait(fd[5], &event, 1, 20000) == 1 && has_ended(), "a connect that never ends");
+}
+
 static const struct scenario scenarios[] = {
 	{ "unix", unix_setup, unix_disturb, unix_verify },
 	{ "dropped", dropped_setup, dropped_disturb, dropped_verify },
@@ -843,6 +895,8 @@ static const struct scenario scenarios[] = {
 	{ "brief", brief_setup, nothing, nothing },
 	{ "connecting", connecting_setup, accept_until_connected, connecting_verify },
 	{ "connecting-closed", connecting_setup, closed_disturb, connecting_verify },
+	{ "polled", polled_setup, polled_disturb, polled_verify },
+	{ "polled-closed", polled_setup, polled_closed_disturb, polled_verify },
 	{ "options", options_setup, options_disturb, options_verify },
 };
 

@@ -224,11 +224,10 @@ struct file_socket {
 	uint32_t others; /* other tables that have it */
 	int domain, type, protocol;
 	bool listening, connected;
-	bool idle; /* has never been connected, and does not listen                    */
-	/* Of TCP, by a connect(2) that blocks: a restored process repeats that                     */
-	bool connecting;
-	int backlog;  /* -1: not read yet */
-	uint8_t shut; /* of a pair's end: SHUT_IN, SHUT_OUT                          */
+	bool idle;       /* has never been connected, and does not listen                    */
+	bool connecting; /* of TCP: a connect(2) is under way                             */
+	int backlog;     /* -1: not read yet */
+	uint8_t shut;    /* of a pair's end: SHUT_IN, SHUT_OUT                          */
 	/* For those that can be recreated: file_socket_is_alone() */
 	uint32_t uid, gid;
 	struct file_option *option; /* files_options.c, allocated               */

@@ -220,9 +220,6 @@ static int bind_socket(int fd, const struct file_socket *s, const char **why)
 {
 	const int yes = 1;
 
-	/* Its port is of the kernel's choice, as a rule, and so is the next one. */
-	if (s->connecting)
-		return 0;
 	/* Connections that it had accepted still have its port. */
 	if (s->type == SOCK_STREAM)
 		setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);
@@ -236,6 +233,27 @@ static int bind_socket(int fd, const struct file_socket *s, const char **why)
 	*why = s->listening ? "it was closed since the checkpoint and its port is taken now"
 			    : "it was closed since the checkpoint and its address is taken now";
 	return -1;
+}
+
+/* Whoever waits in a connect(2) makes it again; its port was of the kernel's choice, as a rule.  Whoever
+ * polls for its end is told of an error, for some programs wait on when there is neither an error nor
+ * a peer.  Port 0 refuses; where a firewall says nothing, to break off is an error, too
+ * (tcp_disconnect()). */
+static int make_connecting(int fd, const struct file *want)
+{
+	const struct sockaddr nobody = { .sa_family = AF_UNSPEC };
+	struct sockaddr_in6 here = { .sin6_family = AF_INET6, .sin6_addr = in6addr_loopback };
+	struct sockaddr_in *here4 = (struct sockaddr_in *)&here;
+
+	if (!(want->flags & O_NONBLOCK))
+		return 0;
+	if (want->socket->domain == AF_INET)
+		*here4 = (struct sockaddr_in){ .sin_family = AF_INET,
+					       .sin_addr.s_addr = htonl(INADDR_LOOPBACK) };
+	if (fcntl(fd, F_SETFL, O_NONBLOCK) ||
+	    !connect(fd, (const struct sockaddr *)&here, sizeof here) || errno != EINPROGRESS)
+		return -1;
+	return connect(fd, &nobody, sizeof nobody);
 }
 
 /* Those that need no peer.  For a Unix socket, listen(2) is left to the restored process, which
@@ -261,8 +279,9 @@ static int make_socket(const struct file *want, pid_t template, pid_t init,
 	if (fchown(fd, s->uid, s->gid))
 		*why = "it does not belong to its user any more";
 	file_put_options(fd, s);
-	if (s->domain == AF_UNIX ? file_bind_unix(fd, s, template, init, why)
-				 : bind_socket(fd, s, why)) {
+	if (s->connecting          ? make_connecting(fd, want)
+	    : s->domain == AF_UNIX ? file_bind_unix(fd, s, template, init, why)
+				   : bind_socket(fd, s, why)) {
 		close(fd);
 		return make_dead(want, template, rights);
 	}

@@ -723,7 +723,9 @@ static void put_states(struct files_work *work)
 			   file_put_state(fd, w, n, work->config->files != AVC_FILES_KEEP));
 		if (w->kind == FILE_INOTIFY)
 			files_note(work, w, file_put_marks(fd, w, n, work->init));
-		if (!w->goes_on && n && n->tcp_state && n->tcp_state != 7 /* TCP_CLOSE */ &&
+		/* One that is still being made has had nothing that could be lost. */
+		if (!w->goes_on && !was_connecting(w) && n && n->tcp_state &&
+		    n->tcp_state != 7 /* TCP_CLOSE */ &&
 		    (work->config->tcp == AVC_TCP_RESET ||
 		     (work->config->tcp == AVC_TCP_RESET_MOVED && file_tcp_moved(w, n))))
 			files_note(work, w, file_reset_tcp(fd));

@@ -134,8 +134,7 @@ void file_look_at_socket(int fd, struct file *file)
 	if (s->listening && s->domain == AF_UNIX)
 		s->backlog = -1;
 	s->idle = is_idle(fd, s);
-	s->connecting = !s->idle && !s->connected && !s->listening && !(file->flags & O_NONBLOCK) &&
-			file_is_connecting(fd, s);
+	s->connecting = !s->idle && !s->connected && !s->listening && file_is_connecting(fd, s);
 	file_socket_free(file->socket);
 	file->socket = s;
 }
