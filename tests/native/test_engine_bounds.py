@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from pathlib import Path
 
@@ -93,6 +94,23 @@ def test_as_many_processes_as_are_supported(tmp_path: Path) -> None:
             kill_main(crowd)
             assert guard.wait("restored", since=since, timeout_s=PATIENCE_S)["threads"] == 501
             crowd.wait_beats()
+
+
+def test_templates_that_nobody_has_reaped_are_not_counted(tmp_path: Path) -> None:
+    """Init gets no CPU to wait for those of dropped generations, which are its children."""
+    with (
+        Victim("crowd shared 260 0", tmp_path) as crowd,
+        GuardProcess(config(keep=1, freeze_deadline_s=2.0), [crowd.pid]) as guard,
+    ):
+        assert guard.command("checkpoint", timeout_s=PATIENCE_S)["kind"] == "checkpoint"
+        os.kill(crowd.pid, signal.SIGSTOP)
+        try:
+            for _ in range(3):
+                told = guard.command("checkpoint", timeout_s=PATIENCE_S)
+                assert told["kind"] == "checkpoint", told
+        finally:
+            os.kill(crowd.pid, signal.SIGCONT)
+        crowd.wait_beats()
 
 
 def test_what_it_has_open_is_bounded(tmp_path: Path) -> None:

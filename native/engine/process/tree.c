@@ -38,12 +38,12 @@ struct looking {
 
 static int add_entry(struct tree *tree, pid_t pid, int parent, struct avc_error *err)
 {
-	if (tree->count == PROCESSES_MAX)
-		return fail(err, AVC_UNSUPPORTED, 0, tree_main(tree)->pid, "look at processes", "",
-			    "it has more than %d processes", PROCESSES_MAX);
 	for (uint32_t i = 0; i < tree->count; i++)
 		if (tree->entry[i].pid == pid)
 			return 0; /* its parent has just exited: seen twice */
+	if (tree->count == PROCESSES_MAX)
+		return fail(err, AVC_UNSUPPORTED, 0, tree_main(tree)->pid, "look at processes", "",
+			    "it has more than %d processes", PROCESSES_MAX);
 	tree->entry[tree->count++] = (struct tree_entry){ .pid = pid, .parent = parent };
 	return 0;
 }
@@ -136,12 +136,28 @@ int tree_check_made(const struct tree *tree, bool (*is_known)(pid_t pid, const v
 	return 0;
 }
 
+/* A zombie; not a main thread that has exited before its threads. */
+static bool is_zombie(const struct proc_stat *stat)
+{
+	return (stat->state == 'Z' || stat->state == 'X') && stat->threads < 2;
+}
+
+/* Nobody but init waits for it: an orphan of the app's, or a template that has been dropped.  There may
+ * be hundreds where init gets no CPU to reap them. */
+static bool has_ended(pid_t pid)
+{
+	struct proc_stat stat;
+
+	return proc_stat(pid, &stat) || is_zombie(&stat);
+}
+
 /* A child of init that does not belong to the app. */
 static int is_none(struct tree *tree, pid_t pid, struct avc_error *err)
 {
-	return pid == tree_main(tree)->leader || tree->is_ours(pid, tree->arg)
-		       ? 1
-		       : is_clone(tree, pid, err);
+	if (pid == tree_main(tree)->leader || tree->is_ours(pid, tree->arg) ||
+	    (!has_process(tree, pid) && has_ended(pid)))
+		return 1;
+	return is_clone(tree, pid, err);
 }
 
 /* A child is listed under the thread that forked it. */
@@ -178,12 +194,6 @@ static int look_below_init(struct tree *tree, struct avc_error *err)
 			return -1;
 	}
 	return 0;
-}
-
-/* A zombie; not a main thread that has exited before its threads. */
-static bool is_zombie(const struct proc_stat *stat)
-{
-	return (stat->state == 'Z' || stat->state == 'X') && stat->threads < 2;
 }
 
 /* ---- processes -------------------------------------------------------------------- */
