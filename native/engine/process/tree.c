@@ -42,7 +42,8 @@ static int add_entry(struct tree *tree, pid_t pid, int parent, struct avc_error 
 		if (tree->entry[i].pid == pid)
 			return 0; /* its parent has just exited: seen twice */
 	if (tree->count == PROCESSES_MAX)
-		return fail(err, AVC_UNSUPPORTED, 0, tree_main(tree)->pid, "look at processes", "",
+		/* Some may be gone at the next attempt (policy_missed()). */
+		return fail(err, AVC_UNSUPPORTED, 0, pid, "look at processes", "",
 			    "it has more than %d processes", PROCESSES_MAX);
 	tree->entry[tree->count++] = (struct tree_entry){ .pid = pid, .parent = parent };
 	return 0;
