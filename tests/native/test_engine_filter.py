@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import platform
 import random
 import select
 import signal
@@ -19,26 +18,18 @@ import pytest
 from avckpt.guard import Images
 
 from testkit import seccomp
+from testkit.engine_program import link_with_engine
 from testkit.guarded import GuardProcess, Victim, config, kill_at_random
-from testkit.harness import ROOT, wait_until
+from testkit.harness import wait_until
 from testkit.procfs import children_of, comm_of, status_of
 
-CPU = platform.machine()
 CAP_KILL, CAP_SYS_PTRACE, CAP_SYS_ADMIN = 1 << 5, 1 << 19, 1 << 21
-LAYERS = ("base", f"base/{CPU}", "trace", "state", "files", "process", "checkpoint", "restore", "guard")
 
 
 @pytest.fixture(scope="module")
 def filtered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """tests/native/filtered.c."""
-    program = tmp_path_factory.mktemp("filtered") / "filtered"
-    native = ROOT / "native"
-    includes = [native / "include", native / "build", native / "parasite", native / "parasite" / CPU]
-    includes += [native / "lastpid", *(native / "engine" / layer for layer in LAYERS)]
-    flags = ["-std=gnu11", "-D_GNU_SOURCE", "-pthread", *(f"-I{folder}" for folder in includes)]
-    source = Path(__file__).with_name("filtered.c")
-    subprocess.run(["cc", *flags, source, native / "build/libavckpt.a", "-o", program], check=True, timeout=120)
-    return program
+    return link_with_engine("filtered", tmp_path_factory.mktemp("filtered"))
 
 
 def test_what_a_guard_may_not_do(filtered: Path) -> None:

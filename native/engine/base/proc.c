@@ -238,20 +238,33 @@ void proc_await_end(pid_t tid)
 	}
 }
 
+#define LONGEST_NUMBER sizeof "4194304"
+#define CHILDREN_TRIES 64
+
+/* A read(2) of this file returns at most a page, and for the next one the kernel finds its place by
+ * counting: if an earlier child is reaped in between, another one is left out (fs/proc/array.c,
+ * get_children_pid()).  Two reads that say the same have left out none. */
 static int read_children(int fd, pid_t *children, int max)
 {
-	char buf[CHILDREN_MAX * sizeof "4194304"];
-	ssize_t n;
+	char text[2][CHILDREN_MAX * LONGEST_NUMBER], *last = text[0];
+	ssize_t n = 0;
 
 	if (fd < 0)
 		return -1;
-	/* A read(2) of many of these files returns at most a page. */
-	n = read_whole(fd, (uint8_t *)buf, sizeof buf - 1, 0);
+	for (int i = 0; i < CHILDREN_TRIES; i++) {
+		const ssize_t before = n;
+
+		last = text[i % 2];
+		n = read_whole(fd, (uint8_t *)last, sizeof *text - 1, 0);
+		if (n < (ssize_t)(ARCH_PAGE_BYTES - LONGEST_NUMBER) ||
+		    (n == before && !memcmp(text[0], text[1], (size_t)n)))
+			break;
+	}
 	close(fd);
 	if (n < 0)
 		return -1;
-	buf[n] = 0;
-	return proc_parse_children(buf, children, max);
+	last[n] = 0;
+	return proc_parse_children(last, children, max);
 }
 
 int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max)
