@@ -449,10 +449,38 @@ def test_sockets_made_again(scenario: str, where: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-@pytest.mark.parametrize("scenario", ["connecting", "connecting-closed", "polled", "polled-closed"])
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        "connecting",
+        "connecting-closed",
+        "polled",
+        "polled-closed",
+        "unseen",
+        "unseen-closed",
+        "refused",
+        "refused-closed",
+    ],
+)
 def test_a_connect_under_way_comes_to_an_end(scenario: str, where: str, tmp_path: Path) -> None:
     """Also if its socket was connected since, or closed.  One that blocks is begun anew, with the same options; one
     that does not block ends with an error, or with a peer."""
+    with (
+        Victim(f"listeners {scenario} {tmp_path} {where}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        checkpoint(guard)
+        disturb(victim)
+        for _ in range(2):
+            event = restored(victim, guard)
+            assert "error" not in event, event
+
+
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("scenario", ["received", "received-half", "received-closed"])
+def test_what_a_peer_sent_last(scenario: str, where: str, tmp_path: Path) -> None:
+    """If some of it was read since, the connection ends with an error: without one, what was received before would
+    count as all."""
     with (
         Victim(f"listeners {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,

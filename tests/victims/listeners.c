@@ -882,6 +882,96 @@ static void polled_verify(void)
 	CHECK(epoll_wait(fd[5], &event, 1, 20000) == 1 && has_ended(), "a connect that never ends");
 }
 
+/* ---- one that is made, which its process has not seen yet -------------------------------------- */
+
+static void unseen_setup(void)
+{
+	struct epoll_event event = { .events = EPOLLOUT | EPOLLIN | EPOLLET };
+
+	fd[0] = listen_inet(0, SOCK_NONBLOCK, 1);
+	remember_name(0);
+	fd[1] = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK, 0);
+	fd[5] = epoll_create1(0);
+	must(connect(fd[1], (struct sockaddr *)&name[0], name_bytes[0]) && errno == EINPROGRESS &&
+		     !epoll_ctl(fd[5], EPOLL_CTL_ADD, fd[1], &event),
+	     "connect");
+}
+
+static void unseen_disturb(void)
+{
+	must(has_ended() && send(fd[1], "hello", 5, 0) == 5, "neither an error nor a peer");
+}
+
+/* ---- one that was refused, likewise ---------------------------------------------------------------- */
+
+static void refused_setup(void)
+{
+	struct epoll_event event = { .events = EPOLLOUT | EPOLLIN | EPOLLET };
+
+	fd[0] = listen_inet(0, SOCK_NONBLOCK, 1);
+	remember_name(0);
+	close(fd[0]);
+	fd[1] = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK, 0);
+	fd[5] = epoll_create1(0);
+	must(connect(fd[1], (struct sockaddr *)&name[0], name_bytes[0]) && errno == EINPROGRESS &&
+		     !epoll_ctl(fd[5], EPOLL_CTL_ADD, fd[1], &event),
+	     "connect");
+}
+
+static void refused_disturb(void)
+{
+	must(has_ended() && !has_ended(), "no error");
+}
+
+/* ---- the end of what a peer sends ---------------------------------------------------------------- */
+
+static char received[64];
+
+static void received_setup(void)
+{
+	fd[0] = listen_inet(0, 0, 1);
+	remember_name(0);
+	fd[1] = socket(AF_INET, SOCK_STREAM, 0);
+	must(!connect(fd[1], (struct sockaddr *)&name[0], name_bytes[0]), "connect");
+	fd[2] = accept(fd[0], NULL, NULL);
+	must(send(fd[2], "one ", 4, 0) == 4 && recv(fd[1], received, 4, MSG_WAITALL) == 4, "recv");
+}
+
+/* It has said all that it will, but does hear the rest. */
+static void received_half_setup(void)
+{
+	received_setup();
+	must(!shutdown(fd[1], SHUT_WR), "shutdown");
+}
+
+static void send_the_rest(void)
+{
+	must(send(fd[2], "two three", 9, 0) == 9, "send");
+	close(fd[2]);
+	usleep(10000);
+}
+
+static void received_disturb(void)
+{
+	send_the_rest();
+	must(recv(fd[1], received + 4, 4, MSG_WAITALL) == 4, "recv");
+}
+
+static void received_closed_disturb(void)
+{
+	received_disturb();
+	close(fd[1]);
+}
+
+/* Neither the third without the second, nor the end after the first. */
+static void received_verify(void)
+{
+	const ssize_t n = recv(fd[1], received + 4, 9, 0);
+
+	CHECK(n < 0 && errno == ECONNRESET, "it received '%.*s' and has not heard of a loss: %zd",
+	      (int)sizeof received, received, n);
+}
+
 static const struct scenario scenarios[] = {
 	{ "unix", unix_setup, unix_disturb, unix_verify },
 	{ "dropped", dropped_setup, dropped_disturb, dropped_verify },
@@ -897,6 +987,13 @@ static const struct scenario scenarios[] = {
 	{ "connecting-closed", connecting_setup, closed_disturb, connecting_verify },
 	{ "polled", polled_setup, polled_disturb, polled_verify },
 	{ "polled-closed", polled_setup, polled_closed_disturb, polled_verify },
+	{ "unseen", unseen_setup, unseen_disturb, polled_verify },
+	{ "unseen-closed", unseen_setup, polled_closed_disturb, polled_verify },
+	{ "refused", refused_setup, refused_disturb, polled_verify },
+	{ "refused-closed", refused_setup, polled_closed_disturb, polled_verify },
+	{ "received", received_setup, received_disturb, received_verify },
+	{ "received-half", received_half_setup, received_disturb, received_verify },
+	{ "received-closed", received_setup, received_closed_disturb, received_verify },
 	{ "options", options_setup, options_disturb, options_verify },
 };
 

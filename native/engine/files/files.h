@@ -310,10 +310,12 @@ struct file {
 	uint64_t tcp_written, tcp_taken; /* bytes, by the app                      */
 	uint64_t tcp_unread;             /* received, and not read yet */
 	bool tcp_counted;                /* these three are exact                  */
+	bool tcp_failed;                 /* it has an error that was not read yet (SO_ERROR) */
 	int tcp_state; /* 0: no connection over a network                           */
 	/* In the middle of a message, as far as known (files_stream.c) */
 	bool tcp_coming, tcp_going;
-	bool goes_on; /* at a restore: its other end was rolled back, too (files_group.c) */
+	bool accepted; /* at a restore: it is a server's (files_find_accepted())   */
+	bool goes_on;  /* at a restore: its other end was rolled back, too (files_group.c) */
 	/* What can be read from it, when its other end is the app's own as well   */
 	uint8_t *content; /* of messages: each with its length in front, uint32_t  */
 	uint32_t content_bytes;
@@ -488,7 +490,16 @@ ssize_t file_send_as_nobody(int fd, const void *data, size_t bytes, const int *p
 /* `passed`: descriptors of ours for want->flight, -1: lost; NULL: all are. */
 const char *file_put_content(int fd, int other_fd, const struct file *want, const int *passed);
 bool file_tcp_moved(const struct file *want, const struct file *now);
+/* Which ones belong to a server: a port on which the app listens. */
+void files_find_accepted(struct files *files);
+/* Whether it is a client's, and its peer may have had more to say: the end of file would make what was
+ * received so far count as complete (HTTP/1.0, FTP), and without an error some wait on who poll for a
+ * connection.  A server knows the end of a request by its contents; not all survive an error. */
+bool file_tcp_is_cut(const struct file *file);
 const char *file_reset_tcp(int fd);
+/* The same, with the error of a connection that was reset (ECONNRESET), also if it is none any more: it
+ * is connected to nobody before, without a packet (TCP_REPAIR). */
+int file_break_tcp(int fd, int domain);
 
 /* files_options.c */
 /* Takes a reference; may be NULL. */

@@ -185,7 +185,8 @@ static void leave_content(int fd, int other_fd, const struct file *want)
 		(void)file_put_content(fd, other_fd, want, NULL);
 }
 
-/* A socket or pipe that reads as closed by the peer, after its contents. */
+/* A socket or pipe that reads as closed by the peer, after its contents; one that was cut off, first as
+ * reset. */
 static int make_dead(const struct file *want, pid_t template, const struct file_rights *rights)
 {
 	const struct file_socket *s = want->socket;
@@ -204,6 +205,8 @@ static int make_dead(const struct file *want, pid_t template, const struct file_
 	if (s && s->protocol == IPPROTO_TCP) {
 		fd = socket_of(template, s->domain, SOCK_STREAM, IPPROTO_TCP);
 		if (fd >= 0) {
+			if (file_tcp_is_cut(want))
+				(void)file_break_tcp(fd, s->domain);
 			shutdown(fd, SHUT_RDWR); /* ENOTCONN, and done (net/ipv4/af_inet.c) */
 			return fd;
 		}
@@ -237,23 +240,10 @@ static int bind_socket(int fd, const struct file_socket *s, const char **why)
 
 /* Whoever waits in a connect(2) makes it again; its port was of the kernel's choice, as a rule.  Whoever
  * polls for its end is told of an error, for some programs wait on when there is neither an error nor
- * a peer.  Port 0 refuses; where a firewall says nothing, to break off is an error, too
- * (tcp_disconnect()). */
+ * a peer. */
 static int make_connecting(int fd, const struct file *want)
 {
-	const struct sockaddr nobody = { .sa_family = AF_UNSPEC };
-	struct sockaddr_in6 here = { .sin6_family = AF_INET6, .sin6_addr = in6addr_loopback };
-	struct sockaddr_in *here4 = (struct sockaddr_in *)&here;
-
-	if (!(want->flags & O_NONBLOCK))
-		return 0;
-	if (want->socket->domain == AF_INET)
-		*here4 = (struct sockaddr_in){ .sin_family = AF_INET,
-					       .sin_addr.s_addr = htonl(INADDR_LOOPBACK) };
-	if (fcntl(fd, F_SETFL, O_NONBLOCK) ||
-	    !connect(fd, (const struct sockaddr *)&here, sizeof here) || errno != EINPROGRESS)
-		return -1;
-	return connect(fd, &nobody, sizeof nobody);
+	return want->flags & O_NONBLOCK ? file_break_tcp(fd, want->socket->domain) : 0;
 }
 
 /* Those that need no peer.  For a Unix socket, listen(2) is left to the restored process, which

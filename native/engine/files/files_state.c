@@ -56,7 +56,7 @@ static bool is_idle(int fd, const struct file_socket *s)
 
 	if ((s->domain != AF_UNIX && s->domain != AF_INET && s->domain != AF_INET6) ||
 	    s->type == SOCK_RAW || s->listening || s->connected || poll_for(&state, 1, 0) < 0 ||
-	    state.revents & POLLRDHUP)
+	    state.revents & (POLLRDHUP | POLLERR))
 		return false;
 	/* A stream without a connection reports HUP, but not while connecting (tcp_poll()). */
 	return s->type == SOCK_DGRAM || state.revents & POLLHUP;
@@ -153,6 +153,13 @@ struct tcp_info_tail {
 	uint64_t pacing_rate, max_pacing_rate, bytes_acked, bytes_received;
 };
 
+static bool has_failed(int fd)
+{
+	struct pollfd state = { .fd = fd };
+
+	return poll_for(&state, 1, 0) > 0 && state.revents & POLLERR;
+}
+
 void file_look_at_tcp(int fd, struct file *file, const struct file_socket *s)
 {
 	struct tcp_info_tail info = { 0 }, before;
@@ -189,6 +196,7 @@ void file_look_at_tcp(int fd, struct file *file, const struct file_socket *s)
 	file->tcp_written = info.bytes_acked + (uint64_t)unacknowledged;
 	file->tcp_taken = info.bytes_received - (uint64_t)unread;
 	file->tcp_unread = (uint64_t)unread;
+	file->tcp_failed = file->tcp_state == TCP_CLOSE && has_failed(fd);
 	file->tcp_coming = file_was_coming(&info.head, unread);
 	file->tcp_going = file_is_going(fd);
 }
@@ -796,7 +804,56 @@ const char *file_put_state(int fd, const struct file *want, const struct file *n
 bool file_tcp_moved(const struct file *want, const struct file *now)
 {
 	return !want->tcp_counted || !now->tcp_counted || want->tcp_written != now->tcp_written ||
-	       want->tcp_taken != now->tcp_taken;
+	       want->tcp_taken != now->tcp_taken || (want->tcp_failed && !now->tcp_failed);
+}
+
+static bool is_tcp(const struct file *f)
+{
+	return f->socket && f->socket->protocol == IPPROTO_TCP;
+}
+
+static int port_of(const struct file *f)
+{
+	/* The port is at the same place in an IPv6 address. */
+	return ntohs(((const struct sockaddr_in *)&f->socket->local)->sin_port);
+}
+
+void files_find_accepted(struct files *files)
+{
+	bool listening[UINT16_MAX + 1] = { false };
+
+	for (uint32_t i = 0; i < files->count; i++)
+		if (is_tcp(&files->file[i]) && files->file[i].socket->listening)
+			listening[port_of(&files->file[i])] = true;
+	for (uint32_t i = 0; i < files->count; i++)
+		files->file[i].accepted = is_tcp(&files->file[i]) &&
+					  listening[port_of(&files->file[i])];
+}
+
+bool file_tcp_is_cut(const struct file *f)
+{
+	return is_tcp(f) && !f->accepted &&
+	       (f->tcp_failed || f->tcp_unread || f->tcp_state == TCP_ESTABLISHED ||
+		f->tcp_state == TCP_FIN_WAIT1 || f->tcp_state == TCP_FIN_WAIT2);
+}
+
+int file_break_tcp(int fd, int domain)
+{
+	const struct sockaddr_in here = { .sin_family = AF_INET,
+					  .sin_addr.s_addr = htonl(INADDR_LOOPBACK) };
+	const struct sockaddr_in6 here6 = { .sin6_family = AF_INET6,
+					    .sin6_addr = IN6ADDR_LOOPBACK_INIT };
+	const struct sockaddr nobody = { .sa_family = AF_UNSPEC };
+	const int on = TCP_REPAIR_ON, off = TCP_REPAIR_OFF_NO_WP;
+	int failed;
+
+	if (connect(fd, &nobody, sizeof nobody) ||
+	    setsockopt(fd, IPPROTO_TCP, TCP_REPAIR, &on, sizeof on))
+		return -1;
+	failed = domain == AF_INET ? connect(fd, (const struct sockaddr *)&here, sizeof here)
+				   : connect(fd, (const struct sockaddr *)&here6, sizeof here6);
+	setsockopt(fd, IPPROTO_TCP, TCP_REPAIR, &off, sizeof off);
+	return failed ? -1 : connect(fd, &nobody, sizeof nobody);
 }
 
 /* connect(2) to nothing resets it, shutdown(2) makes it read as closed. */
