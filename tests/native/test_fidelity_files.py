@@ -477,10 +477,10 @@ def test_a_connect_under_way_comes_to_an_end(scenario: str, where: str, tmp_path
 
 
 @pytest.mark.parametrize("where", WHERE)
-@pytest.mark.parametrize("scenario", ["received", "received-half", "received-closed"])
+@pytest.mark.parametrize("scenario", ["received", "received-half", "received-closed", "unread", "unread-half"])
 def test_what_a_peer_sent_last(scenario: str, where: str, tmp_path: Path) -> None:
     """If some of it was read since, the connection ends with an error: without one, what was received before would
-    count as all."""
+    count as all.  If nothing was read, all of it is there."""
     with (
         Victim(f"listeners {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,

@@ -972,6 +972,13 @@ static void received_verify(void)
 	      (int)sizeof received, received, n);
 }
 
+static void unread_verify(void)
+{
+	CHECK(recv(fd[1], received + 4, 9, MSG_PEEK | MSG_WAITALL) == 9 &&
+		      !strcmp(received, "one two three"),
+	      "what nobody had read is lost: %s", strerror(errno));
+}
+
 static const struct scenario scenarios[] = {
 	{ "unix", unix_setup, unix_disturb, unix_verify },
 	{ "dropped", dropped_setup, dropped_disturb, dropped_verify },
@@ -994,6 +1001,8 @@ static const struct scenario scenarios[] = {
 	{ "received", received_setup, received_disturb, received_verify },
 	{ "received-half", received_half_setup, received_disturb, received_verify },
 	{ "received-closed", received_setup, received_closed_disturb, received_verify },
+	{ "unread", received_setup, send_the_rest, unread_verify },
+	{ "unread-half", received_half_setup, send_the_rest, unread_verify },
 	{ "options", options_setup, options_disturb, options_verify },
 };
 

@@ -153,6 +153,14 @@ struct tcp_info_tail {
 	uint64_t pacing_rate, max_pacing_rate, bytes_acked, bytes_received;
 };
 
+/* The peer's FIN counts as a byte that was received, and not as one that is unread (tcp_fin(),
+ * tcp_inq()).  A socket that was closed by both is TCP_CLOSE, too. */
+static bool has_received_end(int state)
+{
+	return state == TCP_CLOSE_WAIT || state == TCP_LAST_ACK || state == TCP_CLOSING ||
+	       state == TCP_TIME_WAIT || state == TCP_CLOSE;
+}
+
 static bool has_failed(int fd)
 {
 	struct pollfd state = { .fd = fd };
@@ -194,7 +202,8 @@ void file_look_at_tcp(int fd, struct file *file, const struct file_socket *s)
 	}
 	file->tcp_state = info.head.tcpi_state;
 	file->tcp_written = info.bytes_acked + (uint64_t)unacknowledged;
-	file->tcp_taken = info.bytes_received - (uint64_t)unread;
+	file->tcp_taken = info.bytes_received - (uint64_t)unread -
+			  has_received_end(file->tcp_state);
 	file->tcp_unread = (uint64_t)unread;
 	file->tcp_failed = file->tcp_state == TCP_CLOSE && has_failed(fd);
 	file->tcp_coming = file_was_coming(&info.head, unread);
