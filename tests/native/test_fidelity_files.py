@@ -492,6 +492,18 @@ def test_what_a_peer_sent_last(scenario: str, where: str, tmp_path: Path) -> Non
             assert "error" not in event, event
 
 
+def test_a_message_whose_sender_has_ended_is_not_continued(tmp_path: Path) -> None:
+    """One that was half read at the checkpoint, and more of it since."""
+    with (
+        Victim(f"listeners received-part {tmp_path}", tmp_path) as victim,
+        GuardProcess(config(tcp=Tcp.MESSAGES), [victim.pid]) as guard,
+    ):
+        checkpoint(guard)
+        disturb(victim)
+        event = restored(victim, guard)
+        assert "error" not in event, event
+
+
 def test_a_socket_that_is_just_being_bound(tmp_path: Path) -> None:
     """It has a name after the restore if and only if bind(2) had returned at the checkpoint."""
     with (

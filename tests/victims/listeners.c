@@ -972,6 +972,22 @@ static void received_verify(void)
 	      (int)sizeof received, received, n);
 }
 
+/* A message is cut in half. */
+static void received_part_setup(void)
+{
+	received_setup();
+	must(send(fd[2], "two", 3, 0) == 3, "send");
+	usleep(10000);
+}
+
+static void received_part_disturb(void)
+{
+	must(send(fd[2], " three", 6, 0) == 6, "send");
+	must(recv(fd[1], received + 4, 4, MSG_WAITALL) == 4, "recv");
+	close(fd[2]);
+	usleep(10000);
+}
+
 static void unread_verify(void)
 {
 	CHECK(recv(fd[1], received + 4, 9, MSG_PEEK | MSG_WAITALL) == 9 &&
@@ -1001,6 +1017,7 @@ static const struct scenario scenarios[] = {
 	{ "received", received_setup, received_disturb, received_verify },
 	{ "received-half", received_half_setup, received_disturb, received_verify },
 	{ "received-closed", received_setup, received_closed_disturb, received_verify },
+	{ "received-part", received_part_setup, received_part_disturb, received_verify },
 	{ "unread", received_setup, send_the_rest, unread_verify },
 	{ "unread-half", received_half_setup, send_the_rest, unread_verify },
 	{ "options", options_setup, options_disturb, options_verify },

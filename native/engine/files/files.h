@@ -500,6 +500,8 @@ const char *file_reset_tcp(int fd);
 /* The same, with the error of a connection that was reset (ECONNRESET), also if it is none any more: it
  * is connected to nobody before, without a packet (TCP_REPAIR). */
 int file_break_tcp(int fd, int domain);
+/* The one or the other. */
+const char *file_lose_tcp(int fd, const struct file *want);
 
 /* files_options.c */
 /* Takes a reference; may be NULL. */

@@ -701,15 +701,6 @@ int files_borrow_placed(const struct files_work *work, const struct file *w)
 			  : proc_borrow_fd(work->table_pidfd, w->fd);
 }
 
-/* Also one that has ended since: it may still have unread bytes, after those that were read. */
-static const char *reset(int fd, const struct file *w)
-{
-	if (!file_tcp_is_cut(w) || file_break_tcp(fd, w->socket->domain))
-		return file_reset_tcp(fd);
-	shutdown(fd, SHUT_RDWR);
-	return NULL;
-}
-
 static void put_states(struct files_work *work)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {
@@ -736,8 +727,8 @@ static void put_states(struct files_work *work)
 		if (!w->goes_on && !was_connecting(w) && n && n->tcp_state &&
 		    (work->config->tcp == AVC_TCP_RESET ||
 		     (work->config->tcp == AVC_TCP_RESET_MOVED && file_tcp_moved(w, n))))
-			files_note(work, w, reset(fd, w));
-		else if (!w->goes_on && n && n->tcp_state == 1 /* TCP_ESTABLISHED */ &&
+			files_note(work, w, file_lose_tcp(fd, w));
+		else if (!w->goes_on && !was_connecting(w) && n && n->tcp_state &&
 			 work->config->tcp == AVC_TCP_MESSAGES && file_tcp_moved(w, n))
 			files_note(work, w, file_put_stream(fd, w, n));
 		if (fd != local)

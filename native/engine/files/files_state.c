@@ -878,3 +878,12 @@ const char *file_reset_tcp(int fd)
 	getsockopt(fd, SOL_SOCKET, SO_ERROR, &error, &bytes);
 	return NULL;
 }
+
+/* Also one that has ended since: it may still have unread bytes, after those that were read. */
+const char *file_lose_tcp(int fd, const struct file *want)
+{
+	if (!file_tcp_is_cut(want) || file_break_tcp(fd, want->socket->domain))
+		return file_reset_tcp(fd);
+	shutdown(fd, SHUT_RDWR);
+	return NULL;
+}

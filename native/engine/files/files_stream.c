@@ -112,8 +112,8 @@ const char *file_put_stream(int fd, const struct file *want, const struct file *
 
 	/* The half message that either side has would be continued by another message. */
 	if ((in && want->tcp_coming) || (out && (want->tcp_going || now->tcp_going)))
-		return file_reset_tcp(fd);
+		return file_lose_tcp(fd, want);
 	if (in && now->tcp_coming && !drain(fd))
-		return file_reset_tcp(fd);
+		return file_lose_tcp(fd, want);
 	return NULL;
 }
