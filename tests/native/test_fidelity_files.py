@@ -11,6 +11,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -490,6 +491,28 @@ def test_what_a_peer_sent_last(scenario: str, where: str, tmp_path: Path) -> Non
         for _ in range(2):
             event = restored(victim, guard)
             assert "error" not in event, event
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_a_unix_server_has_not_said_all(where: str, tmp_path: Path) -> None:
+    """To its client, which has closed the connection since."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as server:
+        server.bind(str(tmp_path / "server"))
+        server.listen()
+        server.settimeout(5)
+        with ThreadPoolExecutor() as pool:
+            accepted = pool.submit(server.accept)
+            accepted.add_done_callback(lambda accepted: accepted.result()[0].send(b"one "))
+            with (
+                Victim(f"listeners outside {tmp_path} {where}", tmp_path) as victim,
+                GuardProcess(config(), [victim.pid]) as guard,
+            ):
+                checkpoint(guard)
+                disturb(victim)
+                for _ in range(2):
+                    event = restored(victim, guard)
+                    assert "error" not in event, event
+            accepted.result()[0].close()
 
 
 def test_a_message_whose_sender_has_ended_is_not_continued(tmp_path: Path) -> None:

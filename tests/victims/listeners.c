@@ -995,6 +995,23 @@ static void unread_verify(void)
 	      "what nobody had read is lost: %s", strerror(errno));
 }
 
+/* ---- the server of a Unix socket, outside ------------------------------------------------------- */
+
+static void outside_setup(void)
+{
+	const struct sockaddr_un server = path_address("server");
+
+	fd[1] = socket(AF_UNIX, SOCK_STREAM, 0);
+	must(!connect(fd[1], (const struct sockaddr *)&server, sizeof server) &&
+		     recv(fd[1], received, 4, MSG_WAITALL) == 4,
+	     "recv");
+}
+
+static void outside_disturb(void)
+{
+	close(fd[1]);
+}
+
 static const struct scenario scenarios[] = {
 	{ "unix", unix_setup, unix_disturb, unix_verify },
 	{ "dropped", dropped_setup, dropped_disturb, dropped_verify },
@@ -1018,6 +1035,7 @@ static const struct scenario scenarios[] = {
 	{ "received-half", received_half_setup, received_disturb, received_verify },
 	{ "received-closed", received_setup, received_closed_disturb, received_verify },
 	{ "received-part", received_part_setup, received_part_disturb, received_verify },
+	{ "outside", outside_setup, outside_disturb, received_verify },
 	{ "unread", received_setup, send_the_rest, unread_verify },
 	{ "unread-half", received_half_setup, send_the_rest, unread_verify },
 	{ "options", options_setup, options_disturb, options_verify },

@@ -185,6 +185,15 @@ static void leave_content(int fd, int other_fd, const struct file *want)
 		(void)file_put_content(fd, other_fd, want, NULL);
 }
 
+/* Likewise for a Unix socket (file_tcp_is_cut()): only the server's has a name. */
+static bool is_cut_unix(const struct file *f)
+{
+	const struct file_socket *s = f->socket;
+
+	return s && s->domain == AF_UNIX && s->connected && !f->ended &&
+	       s->local_bytes <= sizeof(sa_family_t) && s->remote_bytes > sizeof(sa_family_t);
+}
+
 /* A socket or pipe that reads as closed by the peer, after its contents; one that was cut off, first as
  * reset. */
 static int make_dead(const struct file *want, pid_t template, const struct file_rights *rights)
@@ -215,6 +224,9 @@ static int make_dead(const struct file *want, pid_t template, const struct file_
 			     ends))
 		return -1;
 	leave_content(ends[0], ends[1], want);
+	/* Who closes with something unread resets (unix_release_sock()). */
+	if (is_cut_unix(want))
+		(void)send(ends[0], "", 1, MSG_DONTWAIT | MSG_NOSIGNAL);
 	close(ends[1]);
 	return ends[0];
 }
