@@ -113,6 +113,19 @@ def test_templates_that_nobody_has_reaped_are_not_counted(tmp_path: Path) -> Non
         crowd.wait_beats()
 
 
+def test_workers_that_are_killed_and_replaced_all_the_time(tmp_path: Path) -> None:
+    """One of them is nearly always dying, which takes a moment."""
+    tries = 20
+    with (
+        Victim("crowd renewed 10", tmp_path) as crowd,
+        GuardProcess(config(freeze_deadline_s=1.0), [crowd.pid]) as guard,
+    ):
+        taken = [guard.command("checkpoint", timeout_s=PATIENCE_S)["kind"] for _ in range(tries)]
+        assert taken.count("checkpoint") > tries * 2 // 3, taken
+        assert "unprotected" not in taken, taken
+        crowd.wait_beats()
+
+
 def test_what_it_has_open_is_bounded(tmp_path: Path) -> None:
     """File names alone would take 200 MB; the reason is reported in words, and the guard lives on."""
     with (

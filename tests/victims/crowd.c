@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- *   crowd KIND PROCESSES MANY [FOLDER]
+ *   crowd KIND PROCESSES [MANY] [FOLDER]
  *
  * PROCESSES children, each with much of what a checkpoint might have to keep:
  *
@@ -8,9 +8,12 @@
  *   wiped    MANY MB of memory that is wiped in forks (MADV_WIPEONFORK), never touched
  *   named    MANY descriptors of a file, made below the working folder, whose path has 3,000 characters
  *   common   MANY MB of shared memory that all of them have
+ *   renewed  nothing: with each beat the oldest of them is killed and replaced
  */
+#include <signal.h>
 #include <sys/resource.h>
 #include <sys/stat.h>
+#include <sys/wait.h>
 
 #include "victim.h"
 
@@ -54,24 +57,39 @@ static void have(const char *kind, size_t many)
 		}
 }
 
+static void renew(pid_t *oldest)
+{
+	must(!kill(*oldest, SIGKILL) && waitpid(*oldest, NULL, 0) == *oldest, "waitpid");
+	*oldest = fork();
+	must(*oldest >= 0, "fork");
+	while (!*oldest)
+		pause();
+}
+
 int main(int argc, char **argv)
 {
 	volatile uint64_t *there;
+	pid_t *worker;
 	int processes;
+	size_t many;
 
-	victim_start(&argc, argv, 3, "KIND PROCESSES MANY [FOLDER]");
+	victim_start(&argc, argv, 2, "KIND PROCESSES [MANY] [FOLDER]");
 	must(argc < 5 || !chdir(argv[4]), "chdir");
 	processes = atoi(argv[2]);
+	many = argc > 3 ? (size_t)atol(argv[3]) : 0;
+	worker = calloc((size_t)processes, sizeof *worker);
+	must(worker != NULL, "calloc");
 	there = map(4096, PROT_READ | PROT_WRITE, MAP_SHARED);
 	if (!strcmp(argv[1], "common"))
-		map((size_t)atol(argv[3]) << 20, PROT_READ | PROT_WRITE, MAP_SHARED);
+		map(many << 20, PROT_READ | PROT_WRITE, MAP_SHARED);
 	for (int i = 0; i < processes; i++) {
 		const pid_t child = fork();
 
 		must(child >= 0, "fork");
+		worker[i] = child;
 		if (child)
 			continue;
-		have(argv[1], (size_t)atol(argv[3]));
+		have(argv[1], many);
 		__atomic_add_fetch(there, 1, __ATOMIC_RELEASE);
 		for (;;)
 			pause();
@@ -79,8 +97,10 @@ int main(int argc, char **argv)
 	while (*there < (uint64_t)processes)
 		usleep(1000);
 	victim_ready();
-	for (;;) {
+	for (uint64_t i = 0;; i++) {
 		beat();
+		if (!strcmp(argv[1], "renewed"))
+			renew(&worker[i % (uint64_t)processes]);
 		usleep(1000);
 	}
 }

@@ -423,11 +423,11 @@ int freeze_tree(struct freeze *freeze, struct avc_error *err)
 	int result;
 
 	rt_priority_begin();
-	tracee_deadline_set(freeze->timer, freeze->deadline_ns);
 	/* The others stay stopped until it has got a CPU to stop, to be cloned and to come home. */
 	if (freeze->meet)
 		boost_begin(tree_main(freeze->tree)->pid);
 	result = freeze_stop_prepare(freeze->tree, err);
+	tracee_deadline_set(freeze->timer, freeze->deadline_ns);
 	start = generation->taken_ns = now_ns();
 	if (!result)
 		result = stop_and_begin(freeze, err);
