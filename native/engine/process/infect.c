@@ -158,6 +158,10 @@ static int survey(struct process *process, avc_remote pc, avc_remote *cave, stru
 	if (survey.in_stub || parasite_is_old(process, pc))
 		return fail(err, AVC_DEADLINE, 0, process->pid, "infect", "",
 			    "still on its way home from a guard that died");
+	/* It has no memory any more. */
+	if (!*cave && proc_is_exiting(process->pid))
+		return fail(err, AVC_GONE, ESRCH, process->pid, "infect", "read(maps)",
+			    "it has ended");
 	if (!*cave)
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "infect", "",
 			    "there is no room for the first injected instructions");
