@@ -126,6 +126,24 @@ def test_workers_that_are_killed_and_replaced_all_the_time(tmp_path: Path) -> No
         crowd.wait_beats()
 
 
+def test_workers_of_many_generations(tmp_path: Path) -> None:
+    """Each has others of them, which are kept as long as it is: more than there may be at once."""
+    generations, workers = 12, 100
+    with (
+        Victim(f"crowd renewed {workers}", tmp_path) as crowd,
+        GuardProcess(config(keep=generations, freeze_deadline_s=1.0), [crowd.pid]) as guard,
+    ):
+        taken: list[str] = []
+        while taken.count("checkpoint") < generations:
+            taken.append(guard.command("checkpoint", timeout_s=PATIENCE_S)["kind"])
+            assert "unprotected" not in taken
+            crowd.wait_beats(workers)
+        since = guard.mark()
+        kill_main(crowd)
+        assert guard.wait("restored", since=since, timeout_s=PATIENCE_S)["threads"] >= workers
+        crowd.wait_beats(workers)
+
+
 def test_what_it_has_open_is_bounded(tmp_path: Path) -> None:
     """File names alone would take 200 MB; the reason is reported in words, and the guard lives on."""
     with (

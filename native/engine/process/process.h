@@ -40,7 +40,7 @@ struct tree {
 	/* The main one first, which always stays; others also after their end, as long as there are
 	 * images of them. */
 	struct process **process;
-	uint32_t processes;
+	uint32_t processes, process_room;
 	/* Children of init that are tracees, found while clones were being made: templates, unless
 	 * tree_check_made() finds another one. */
 	pid_t *made;

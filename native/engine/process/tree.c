@@ -19,9 +19,9 @@
 int tree_init(struct tree *tree, struct process *main)
 {
 	tree->entry = calloc(PROCESSES_MAX, sizeof *tree->entry);
-	tree->process = calloc(2 * PROCESSES_MAX, sizeof(struct process *));
 	tree->made = calloc(PROCESSES_MAX, sizeof *tree->made);
-	if (!tree->entry || !tree->process || !tree->made)
+	if (!tree->entry || !tree->made ||
+	    !make_room(&tree->process, 0, &tree->process_room, sizeof *tree->process))
 		return -1;
 	tree->process[tree->processes++] = main;
 	return 0;
@@ -254,14 +254,11 @@ static void forget_thread(struct process *process, pid_t tid)
 static struct process *add_process(struct tree *tree, pid_t pid, uint64_t start,
 				   struct avc_error *err)
 {
-	struct process *process;
+	struct process *process = NULL;
 
-	if (tree->processes == 2 * PROCESSES_MAX) {
-		fail(err, AVC_UNSUPPORTED, 0, tree_main(tree)->pid, "look at processes", "",
-		     "it has had too many processes since the oldest generation");
-		return NULL;
-	}
-	process = process_new(tree);
+	/* Those of all generations, too: workers that are replaced all the time are others in each. */
+	if (make_room(&tree->process, tree->processes, &tree->process_room, sizeof *tree->process))
+		process = process_new(tree);
 	if (!process) {
 		fail_errno(err, pid, "look at processes", "malloc", "out of memory");
 		return NULL;
@@ -317,7 +314,8 @@ static int check_sharing(struct tree *tree, const struct tree_entry *entry, uint
 		const pid_t other = tree->process[i]->leader;
 		const char *what = NULL;
 
-		if (other == entry->pid) /* it had that number before */
+		/* One that has ended is only in generations; and it had that number before. */
+		if (!other || other == entry->pid)
 			continue;
 		if (!files && proc_shares(entry->pid, other, SHARED_FILES) == 1)
 			what = "descriptor table (CLONE_FILES)";
@@ -474,6 +472,6 @@ void tree_free(struct tree *tree)
 	tree->process = NULL;
 	tree->entry = NULL;
 	tree->made = NULL;
-	tree->processes = 0;
+	tree->processes = tree->process_room = 0;
 	tree->count = 0;
 }
