@@ -126,6 +126,21 @@ def test_workers_that_are_killed_and_replaced_all_the_time(tmp_path: Path) -> No
         crowd.wait_beats()
 
 
+def test_shells_that_redirect_what_they_have_inherited(tmp_path: Path) -> None:
+    """There are always some that do so between the look at their descriptors and the freeze."""
+    tries = 12
+    with (
+        Victim("crowd shells 60", tmp_path) as crowd,
+        GuardProcess(config(freeze_deadline_s=1.0), [crowd.pid]) as guard,
+    ):
+        taken = [guard.command("checkpoint", timeout_s=PATIENCE_S)["kind"] for _ in range(tries)]
+        assert taken.count("checkpoint") > tries * 2 // 3, taken
+        since = guard.mark()
+        kill_main(crowd)
+        guard.wait("restored", since=since, timeout_s=PATIENCE_S)
+        crowd.wait_beats()
+
+
 def test_workers_of_many_generations(tmp_path: Path) -> None:
     """Each has others of them, which are kept as long as it is: more than there may be at once."""
     generations, workers = 12, 100

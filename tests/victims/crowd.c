@@ -9,6 +9,7 @@
  *   named    MANY descriptors of a file, made below the working folder, whose path has 3,000 characters
  *   common   MANY MB of shared memory that all of them have
  *   renewed  nothing: with each beat the oldest of them is killed and replaced
+ *   shells   nothing: and there are more of them, shells that run short commands with redirections
  */
 #include <signal.h>
 #include <sys/resource.h>
@@ -66,6 +67,21 @@ static void renew(pid_t *oldest)
 		pause();
 }
 
+static void run_shell(void)
+{
+	const pid_t shell = fork();
+
+	must(shell >= 0, "fork");
+	if (!shell) {
+		execl("/bin/sh", "sh", "-c", "sleep 0.01; (true; sleep 0.02) | cat >/dev/null",
+		      NULL);
+		_exit(1);
+	}
+	usleep(10000);
+	while (waitpid(-1, NULL, WNOHANG) > 0)
+		;
+}
+
 int main(int argc, char **argv)
 {
 	volatile uint64_t *there;
@@ -101,6 +117,8 @@ int main(int argc, char **argv)
 		beat();
 		if (!strcmp(argv[1], "renewed"))
 			renew(&worker[i % (uint64_t)processes]);
+		if (!strcmp(argv[1], "shells"))
+			run_shell();
 		usleep(1000);
 	}
 }

@@ -59,6 +59,10 @@ int files_fill_heirs(struct image *image, uint32_t images, struct avc_error *err
 /* Checks what the freeze left out, in the templates (files_heirs.c).  AVC_RETRY: what a process
  * shares with its parent has changed meanwhile. */
 int files_check_heirs(struct image *image, uint32_t images, struct avc_error *err) warn_unused;
+/* Whether the heirs of this process may be assumed to be what they were. */
+bool files_trusts_heirs(const struct process *process);
+/* Those of this one were not: if it has just been started, no other such one is trusted either. */
+void files_note_young(struct process *main, const struct process *process);
 /* After it. */
 void files_settle(struct image *image);
 /* Of cameras, in the template (files_video.c). */

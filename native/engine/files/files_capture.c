@@ -121,7 +121,7 @@ static struct files *look_before(struct process *process, const struct process *
 			.owner = { .pid = process->pid,
 				   .pidfd = fcntl(process->pidfd, F_DUPFD_CLOEXEC, 3),
 				   .init = process->init,
-				   .reuses = !process->heirs_change && !process->heirs_vary }
+				   .reuses = !process->heirs_change && files_trusts_heirs(process) }
 		};
 	if (!job || !job->files || job->owner.pidfd < 0) {
 		fail_errno(err, process->pid, "look at descriptors", "calloc", "out of memory");

@@ -10,6 +10,10 @@
  * exchanging them again between a freeze and its check, or by receiving it back then.  One that is
  * found to have others than before is compared before each freeze from then on (heirs_change), so a
  * habit of exchanging does not stay unnoticed.
+ *
+ * One that has just been started may be about to redirect what it has inherited, as the commands of a
+ * shell do.  Where that was found once (young_vary), each is compared until it is known for some
+ * checkpoints: otherwise the next ones of them would make every checkpoint fail.
  */
 #include <dirent.h>
 #include <errno.h>
@@ -27,7 +31,26 @@
 #define SPARSE 4
 #define SPARSE_LEAST 64
 #define NUMBERS_MAX (1 << 20)
+#define YOUNG 4 /* checkpoints, or tries of one                                          */
 #define ASKED_MAX (INJ_FILES_BYTES / 2 / sizeof(struct inj_syscall))
+
+/* ---- which of them are trusted ------------------------------------------------------------- */
+
+static bool is_young(const struct process *process)
+{
+	return process->descendant && process->checkpoints < YOUNG;
+}
+
+bool files_trusts_heirs(const struct process *process)
+{
+	return !process->heirs_vary &&
+	       !(process->main && process->main->young_vary && is_young(process));
+}
+
+void files_note_young(struct process *main, const struct process *process)
+{
+	main->young_vary |= is_young(process);
+}
 
 /* ---- before the first look ---------------------------------------------------------------- */
 
@@ -177,6 +200,7 @@ int files_check_heirs(struct image *image, uint32_t images, struct avc_error *er
 		result = -1;
 		if (failed.code != AVC_RETRY)
 			break;
+		files_note_young(image[0].process, image[i].process);
 	}
 	return result;
 }

@@ -303,8 +303,10 @@ int files_fill_heirs(struct image *image, uint32_t images, struct avc_error *err
 		if (!files_are_read(&image[i]))
 			continue;
 		if (files->heirs) {
-			if (fill_in(&image[i], parent, err))
+			if (fill_in(&image[i], parent, err)) {
+				files_note_young(image[0].process, image[i].process);
 				return -1;
+			}
 			files_find_owners(image[i].process, files);
 			files_find_own_pidfds(image[i].process, files);
 		}

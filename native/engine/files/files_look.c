@@ -164,7 +164,7 @@ static int walk_frozen(struct look *look, struct avc_error *err)
 
 	if (look_at_own(look, &same, err))
 		return -1;
-	look->trusts = same && size == count && !look->files->process->heirs_vary;
+	look->trusts = same && size == count && files_trusts_heirs(look->files->process);
 	look->files->trusted = look->trusts;
 	if (look_may_leave_heirs(look))
 		return look_leave_heirs(look, err);

@@ -251,6 +251,7 @@ struct process {
 	int heirs_count;
 	bool heirs_change; /* inherited files have changed between two checkpoints    */
 	bool heirs_vary;   /* ... in a freeze                                        */
+	bool young_vary;   /* of the main one: ... of one that had just been started     */
 	bool tcp_moved;    /* bytes of connections are counted                 */
 	bool tcp_messages; /* quiescent only between two messages              */
 	/* Of a process that is not the main one (tree.c). */
