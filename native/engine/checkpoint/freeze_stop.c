@@ -91,8 +91,21 @@ int freeze_stop_known(struct tree *tree, struct avc_error *err)
 	return await(tree, stop_all, err);
 }
 
+/* Those that have ended. */
+static uint64_t the_dead(const struct tree *tree)
+{
+	uint64_t dead = 0;
+
+	for (uint32_t i = 1; i < tree->count; i++)
+		if (tree->entry[i].ended || !tree->entry[i].pid)
+			dead = hash_bytes(dead, &tree->entry[i].pid, sizeof tree->entry[i].pid);
+	return dead;
+}
+
 int freeze_stop_others(struct tree *tree, struct avc_error *err)
 {
+	uint64_t dead = the_dead(tree), dead_before;
+
 	/* It had no other one at the last checkpoint; the clone shows whether that is still so. */
 	if (tree->count <= 1 && tree_main(tree)->childless)
 		return 0;
@@ -101,6 +114,11 @@ int freeze_stop_others(struct tree *tree, struct avc_error *err)
 
 		if (tree_scan(tree, err))
 			return -1;
+		/* One that ended during this look may have left a child to a process whose children had been
+		 * listed before: a daemon that has just forked twice. */
+		dead_before = dead;
+		dead = the_dead(tree);
+		all = dead == dead_before;
 		for (uint32_t i = 1; i < tree->count; i++) {
 			struct process *t = tree->entry[i].process;
 			struct avc_error failed = { 0 };
