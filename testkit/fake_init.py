@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import fcntl
 import os
+import signal
 import struct
 import subprocess
 import sys
@@ -39,8 +40,14 @@ def page(app: int, report: int, verdict: int) -> bytes:
 
 def main(kind: str) -> None:
     """Plays init."""
-    ctypes.CDLL(None).prctl(4, 0, 0, 0, 0)  # PR_SET_DUMPABLE, as avckpt-init does
-    app = subprocess.Popen(["/bin/sleep", "1000"], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    libc = ctypes.CDLL(None)
+    libc.prctl(4, 0, 0, 0, 0)  # PR_SET_DUMPABLE, as avckpt-init does
+    app = subprocess.Popen(
+        ["/bin/sleep", "1000"],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        preexec_fn=lambda: libc.prctl(1, signal.SIGKILL, 0, 0, 0),  # PR_SET_PDEATHSIG
+    )
     report, _report_write = os.pipe()
     verdict, verdict_write = os.pipe()
     os.close(verdict_write)

@@ -137,7 +137,12 @@ def test_a_seccomp_filter_holds_for_what_runs_in_it(
 def test_what_init_shows_is_looked_at_first(tmp_path: Path, kind: str) -> None:
     """A process in init's place can make the guard open and map only what it could open and map itself."""
     with (
-        subprocess.Popen([sys.executable, FAKE_INIT, kind], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as init,
+        subprocess.Popen(
+            [sys.executable, FAKE_INIT, kind],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, "TMPDIR": str(tmp_path)},
+        ) as init,
         Victim("idle 1 1", tmp_path) as peaceful,
     ):
         assert init.stdin is not None
