@@ -51,6 +51,15 @@ def restored(victim: Victim, guard: GuardProcess, *, looks: bool = True) -> Json
     return event
 
 
+def restore_twice(victim: Victim, guard: GuardProcess) -> None:
+    """From one checkpoint, disturbed before the first time: everything is put back, with nothing to be told."""
+    checkpoint(guard)
+    disturb(victim)
+    for _ in range(2):
+        event = restored(victim, guard)
+        assert "error" not in event, event
+
+
 def disturb_and_restore(victim: Victim, guard: GuardProcess) -> None:
     """Again and again from each of two checkpoints: everything is put back, with nothing to be told."""
     for _ in range(2):

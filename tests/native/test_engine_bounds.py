@@ -113,28 +113,31 @@ def test_templates_that_nobody_has_reaped_are_not_counted(tmp_path: Path) -> Non
         crowd.wait_beats()
 
 
+def most_are_taken(guard: GuardProcess, tries: int) -> list[str]:
+    """Of so many checkpoints that are asked for; gives the kinds of all answers."""
+    taken = [guard.command("checkpoint", timeout_s=PATIENCE_S)["kind"] for _ in range(tries)]
+    assert taken.count("checkpoint") > tries * 2 // 3, taken
+    return taken
+
+
 def test_workers_that_are_killed_and_replaced_all_the_time(tmp_path: Path) -> None:
     """One of them is nearly always dying, which takes a moment."""
-    tries = 20
     with (
         Victim("crowd renewed 10", tmp_path) as crowd,
         GuardProcess(config(freeze_deadline_s=1.0), [crowd.pid]) as guard,
     ):
-        taken = [guard.command("checkpoint", timeout_s=PATIENCE_S)["kind"] for _ in range(tries)]
-        assert taken.count("checkpoint") > tries * 2 // 3, taken
+        taken = most_are_taken(guard, 20)
         assert "unprotected" not in taken, taken
         crowd.wait_beats()
 
 
 def test_shells_that_redirect_what_they_have_inherited(tmp_path: Path) -> None:
     """There are always some that do so between the look at their descriptors and the freeze."""
-    tries = 12
     with (
         Victim("crowd shells 60", tmp_path) as crowd,
         GuardProcess(config(freeze_deadline_s=1.0), [crowd.pid]) as guard,
     ):
-        taken = [guard.command("checkpoint", timeout_s=PATIENCE_S)["kind"] for _ in range(tries)]
-        assert taken.count("checkpoint") > tries * 2 // 3, taken
+        most_are_taken(guard, 12)
         since = guard.mark()
         kill_main(crowd)
         guard.wait("restored", since=since, timeout_s=PATIENCE_S)

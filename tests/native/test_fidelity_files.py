@@ -30,7 +30,7 @@ from testkit.guarded import (
 from testkit.harness import SLOWNESS, wait_until
 from testkit.meddle import get_fd
 from testkit.procfs import below
-from testkit.scenario import KILLS, checkpoint, disturb, disturb_and_restore, restored, wait_looked
+from testkit.scenario import KILLS, checkpoint, disturb, disturb_and_restore, restore_twice, restored, wait_looked
 
 
 @pytest.fixture(autouse=True)
@@ -470,11 +470,7 @@ def test_a_connect_under_way_comes_to_an_end(scenario: str, where: str, tmp_path
         Victim(f"listeners {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
     ):
-        checkpoint(guard)
-        disturb(victim)
-        for _ in range(2):
-            event = restored(victim, guard)
-            assert "error" not in event, event
+        restore_twice(victim, guard)
 
 
 @pytest.mark.parametrize("where", WHERE)
@@ -486,11 +482,7 @@ def test_what_a_peer_sent_last(scenario: str, where: str, tmp_path: Path) -> Non
         Victim(f"listeners {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
     ):
-        checkpoint(guard)
-        disturb(victim)
-        for _ in range(2):
-            event = restored(victim, guard)
-            assert "error" not in event, event
+        restore_twice(victim, guard)
 
 
 @pytest.mark.parametrize("where", WHERE)
@@ -507,11 +499,7 @@ def test_a_unix_server_has_not_said_all(where: str, tmp_path: Path) -> None:
                 Victim(f"listeners outside {tmp_path} {where}", tmp_path) as victim,
                 GuardProcess(config(), [victim.pid]) as guard,
             ):
-                checkpoint(guard)
-                disturb(victim)
-                for _ in range(2):
-                    event = restored(victim, guard)
-                    assert "error" not in event, event
+                restore_twice(victim, guard)
             accepted.result()[0].close()
 
 

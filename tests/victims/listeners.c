@@ -358,7 +358,7 @@ static void deserted_setup(void)
 	const pid_t parent = getpid();
 	struct stat st;
 
-	fd[0] = listen_inet(0, SOCK_NONBLOCK, 1);
+	fd[0] = listen_inet(0, SOCK_NONBLOCK, 0);
 	fd[1] = make_file("shared", "", O_RDWR);
 	must(unlink(path_of("shared")) == 0 && fstat(fd[1], &st) == 0, "unlink");
 	shared_ino = st.st_ino;
@@ -837,16 +837,21 @@ static void connecting_verify(void)
 
 /* ---- the same without blocking ----------------------------------------------------------- */
 
-static void polled_setup(void)
+static void connect_and_poll(void)
 {
 	struct epoll_event event = { .events = EPOLLOUT | EPOLLIN | EPOLLET };
 
-	fill_queue();
 	fd[1] = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK, 0);
 	fd[5] = epoll_create1(0);
 	must(connect(fd[1], (struct sockaddr *)&name[0], name_bytes[0]) && errno == EINPROGRESS &&
 		     !epoll_ctl(fd[5], EPOLL_CTL_ADD, fd[1], &event),
 	     "connect");
+}
+
+static void polled_setup(void)
+{
+	fill_queue();
+	connect_and_poll();
 }
 
 /* As Go has it: with an error or a peer. */
@@ -870,7 +875,7 @@ static void polled_disturb(void)
 	must(has_ended() && send(fd[1], "hello", 5, 0) == 5, "neither an error nor a peer");
 }
 
-static void polled_closed_disturb(void)
+static void close_disturb(void)
 {
 	close(fd[1]);
 }
@@ -886,15 +891,9 @@ static void polled_verify(void)
 
 static void unseen_setup(void)
 {
-	struct epoll_event event = { .events = EPOLLOUT | EPOLLIN | EPOLLET };
-
 	fd[0] = listen_inet(0, SOCK_NONBLOCK, 1);
 	remember_name(0);
-	fd[1] = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK, 0);
-	fd[5] = epoll_create1(0);
-	must(connect(fd[1], (struct sockaddr *)&name[0], name_bytes[0]) && errno == EINPROGRESS &&
-		     !epoll_ctl(fd[5], EPOLL_CTL_ADD, fd[1], &event),
-	     "connect");
+	connect_and_poll();
 }
 
 static void unseen_disturb(void)
@@ -906,16 +905,10 @@ static void unseen_disturb(void)
 
 static void refused_setup(void)
 {
-	struct epoll_event event = { .events = EPOLLOUT | EPOLLIN | EPOLLET };
-
 	fd[0] = listen_inet(0, SOCK_NONBLOCK, 1);
 	remember_name(0);
 	close(fd[0]);
-	fd[1] = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK, 0);
-	fd[5] = epoll_create1(0);
-	must(connect(fd[1], (struct sockaddr *)&name[0], name_bytes[0]) && errno == EINPROGRESS &&
-		     !epoll_ctl(fd[5], EPOLL_CTL_ADD, fd[1], &event),
-	     "connect");
+	connect_and_poll();
 }
 
 static void refused_disturb(void)
@@ -1007,11 +1000,6 @@ static void outside_setup(void)
 	     "recv");
 }
 
-static void outside_disturb(void)
-{
-	close(fd[1]);
-}
-
 static const struct scenario scenarios[] = {
 	{ "unix", unix_setup, unix_disturb, unix_verify },
 	{ "dropped", dropped_setup, dropped_disturb, dropped_verify },
@@ -1026,16 +1014,16 @@ static const struct scenario scenarios[] = {
 	{ "connecting", connecting_setup, accept_until_connected, connecting_verify },
 	{ "connecting-closed", connecting_setup, closed_disturb, connecting_verify },
 	{ "polled", polled_setup, polled_disturb, polled_verify },
-	{ "polled-closed", polled_setup, polled_closed_disturb, polled_verify },
+	{ "polled-closed", polled_setup, close_disturb, polled_verify },
 	{ "unseen", unseen_setup, unseen_disturb, polled_verify },
-	{ "unseen-closed", unseen_setup, polled_closed_disturb, polled_verify },
+	{ "unseen-closed", unseen_setup, close_disturb, polled_verify },
 	{ "refused", refused_setup, refused_disturb, polled_verify },
-	{ "refused-closed", refused_setup, polled_closed_disturb, polled_verify },
+	{ "refused-closed", refused_setup, close_disturb, polled_verify },
 	{ "received", received_setup, received_disturb, received_verify },
 	{ "received-half", received_half_setup, received_disturb, received_verify },
 	{ "received-closed", received_setup, received_closed_disturb, received_verify },
 	{ "received-part", received_part_setup, received_part_disturb, received_verify },
-	{ "outside", outside_setup, outside_disturb, received_verify },
+	{ "outside", outside_setup, close_disturb, received_verify },
 	{ "unread", received_setup, send_the_rest, unread_verify },
 	{ "unread-half", received_half_setup, send_the_rest, unread_verify },
 	{ "options", options_setup, options_disturb, options_verify },

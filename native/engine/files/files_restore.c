@@ -701,6 +701,20 @@ int files_borrow_placed(const struct files_work *work, const struct file *w)
 			  : proc_borrow_fd(work->table_pidfd, w->fd);
 }
 
+/* What `tcp` says of a connection that is still open.  One that is still being made has had nothing that
+ * could be lost. */
+static const char *put_connection(const struct files_work *work, int fd, const struct file *w,
+				  const struct file *n)
+{
+	const enum avc_tcp tcp = work->config->tcp;
+
+	if (w->goes_on || was_connecting(w) || !n || !n->tcp_state)
+		return NULL;
+	if (tcp == AVC_TCP_RESET || (tcp == AVC_TCP_RESET_MOVED && file_tcp_moved(w, n)))
+		return file_lose_tcp(fd, w);
+	return tcp == AVC_TCP_MESSAGES && file_tcp_moved(w, n) ? file_put_stream(fd, w, n) : NULL;
+}
+
 static void put_states(struct files_work *work)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {
@@ -723,14 +737,7 @@ static void put_states(struct files_work *work)
 			   file_put_state(fd, w, n, work->config->files != AVC_FILES_KEEP));
 		if (w->kind == FILE_INOTIFY)
 			files_note(work, w, file_put_marks(fd, w, n, work->init));
-		/* One that is still being made has had nothing that could be lost. */
-		if (!w->goes_on && !was_connecting(w) && n && n->tcp_state &&
-		    (work->config->tcp == AVC_TCP_RESET ||
-		     (work->config->tcp == AVC_TCP_RESET_MOVED && file_tcp_moved(w, n))))
-			files_note(work, w, file_lose_tcp(fd, w));
-		else if (!w->goes_on && !was_connecting(w) && n && n->tcp_state &&
-			 work->config->tcp == AVC_TCP_MESSAGES && file_tcp_moved(w, n))
-			files_note(work, w, file_put_stream(fd, w, n));
+		files_note(work, w, put_connection(work, fd, w, n));
 		if (fd != local)
 			close(fd);
 	}
