@@ -23,7 +23,8 @@ import mmap, os, socketserver, sys, time
 file = open("/tmp/ledger", "w+b", buffering=0)
 shared = mmap.mmap(-1, 4096)
 started = time.monotonic_ns()
-class Server(socketserver.TCPServer):
+address = sys.argv[1]
+class Server(socketserver.TCPServer if address.isdigit() else socketserver.UnixStreamServer):
     allow_reuse_address = True
 class Handler(socketserver.StreamRequestHandler):
     def handle(self):
@@ -33,15 +34,21 @@ class Handler(socketserver.StreamRequestHandler):
             if line == b"count\\n":
                 shared[0] += 1
             self.wfile.write(b"%d %d %d\\n" % (os.lseek(file.fileno(), 0, os.SEEK_CUR), shared[0], started))
-Server(("127.0.0.1", int(sys.argv[1])), Handler).serve_forever()
+Server(("127.0.0.1", int(address)) if address.isdigit() else "\\0" + address, Handler).serve_forever()
 """
 
 
 class Client:
     """One connection to the keeper."""
 
-    def __init__(self, port: int) -> None:
-        self._socket = socket.create_connection(("127.0.0.1", port), timeout=5)
+    def __init__(self, address: int | str) -> None:
+        """A port, or an abstract name of a Unix socket."""
+        if isinstance(address, int):
+            self._socket = socket.create_connection(("127.0.0.1", address), timeout=5)
+        else:
+            self._socket = socket.socket(socket.AF_UNIX)
+            self._socket.settimeout(5)
+            self._socket.connect("\0" + address)
         self._lines = self._socket.makefile("rb")
 
     def close(self) -> None:
@@ -59,10 +66,10 @@ class Client:
 
 
 @contextmanager
-def connected(port: int) -> Iterator[Client]:
+def connected(address: int | str) -> Iterator[Client]:
     def connect() -> Client | None:
         try:
-            return Client(port)
+            return Client(address)
         except OSError:
             return None
 
@@ -74,10 +81,10 @@ def connected(port: int) -> Iterator[Client]:
         client.close()
 
 
-def start(factory: ContainerFactory, port: int, *options: str, **labels: str) -> Container:
+def start(factory: ContainerFactory, address: int | str, *options: str, **labels: str) -> Container:
     """Starts a keeper whose checkpoints are taken on command."""
     return factory.protected(
-        *("python3", "-c", KEEPER, str(port)),
+        *("python3", "-c", KEEPER, str(address)),
         labels={"interval": "1h", "restore.max": "60/60s", **labels},
         options=["--network=host", *options],
     )
@@ -105,15 +112,23 @@ def test_offsets_and_shared_memory(
 
 
 @pytest.mark.parametrize(
-    ("labels", "moved", "lives"),
-    [({"tcp": "reset"}, False, False), ({}, True, False), ({}, False, True), ({"tcp": "keep"}, True, True)],
+    ("kind", "labels", "moved", "lives"),
+    [
+        ("tcp", {"tcp": "reset"}, False, False),
+        ("tcp", {}, True, False),
+        ("tcp", {}, False, True),
+        ("tcp", {"tcp": "keep"}, True, True),
+        ("unix", {}, False, False),
+        ("unix", {"tcp": "keep"}, True, True),
+    ],
 )
 def test_connections(
-    sidecar: Sidecar, container: ContainerFactory, labels: dict[str, str], moved: bool, lives: bool
+    sidecar: Sidecar, container: ContainerFactory, kind: str, labels: dict[str, str], moved: bool, lives: bool
 ) -> None:
     port = free_port()
-    keeper = start(container, port, **labels)
-    with connected(port) as client:
+    address = port if kind == "tcp" else f"keeper-{port}"
+    keeper = start(container, address, **labels)
+    with connected(address) as client:
         started = client.ask("look")[2]
         take_checkpoint(sidecar.client, keeper.name)
         if moved:
@@ -126,7 +141,7 @@ def test_connections(
             with pytest.raises(ConnectionError):
                 client.ask("look")
     # Peers reconnect, to the very same process.
-    with connected(port) as client:
+    with connected(address) as client:
         assert client.ask("look")[2] == started
 
 

@@ -486,17 +486,18 @@ def test_what_a_peer_sent_last(scenario: str, where: str, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_a_unix_server_has_not_said_all(where: str, tmp_path: Path) -> None:
-    """To its client, which has closed the connection since."""
+@pytest.mark.parametrize(("scenario", "name"), [("outside", "server"), ("outside-open", "server"), ("bus", "bus")])
+def test_a_unix_server_outside(scenario: str, name: str, where: str, tmp_path: Path) -> None:
+    """Its client hears that it may have more to say, also where it had closed the connection; a D-Bus is kept."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as server:
-        server.bind(str(tmp_path / "server"))
+        server.bind(str(tmp_path / name))
         server.listen()
         server.settimeout(5)
         with ThreadPoolExecutor() as pool:
             accepted = pool.submit(server.accept)
             accepted.add_done_callback(lambda accepted: accepted.result()[0].send(b"one "))
             with (
-                Victim(f"listeners outside {tmp_path} {where}", tmp_path) as victim,
+                Victim(f"listeners {scenario} {tmp_path} {where}", tmp_path) as victim,
                 GuardProcess(config(), [victim.pid]) as guard,
             ):
                 restore_twice(victim, guard)

@@ -990,14 +990,34 @@ static void unread_verify(void)
 
 /* ---- the server of a Unix socket, outside ------------------------------------------------------- */
 
-static void outside_setup(void)
+static void connect_outside(const char *file)
 {
-	const struct sockaddr_un server = path_address("server");
+	const struct sockaddr_un server = path_address(file);
 
 	fd[1] = socket(AF_UNIX, SOCK_STREAM, 0);
 	must(!connect(fd[1], (const struct sockaddr *)&server, sizeof server) &&
 		     recv(fd[1], received, 4, MSG_WAITALL) == 4,
 	     "recv");
+}
+
+static void outside_setup(void)
+{
+	connect_outside("server");
+}
+
+static void nothing_disturb(void)
+{
+}
+
+static void bus_setup(void)
+{
+	connect_outside("bus");
+}
+
+static void bus_verify(void)
+{
+	CHECK(send(fd[1], "two", 3, MSG_NOSIGNAL) == 3, "its bus is lost: %s", strerror(errno));
+	CHECK(recv(fd[1], received, 1, MSG_DONTWAIT) < 0 && errno == EAGAIN, "its bus has ended");
 }
 
 static const struct scenario scenarios[] = {
@@ -1024,6 +1044,8 @@ static const struct scenario scenarios[] = {
 	{ "received-closed", received_setup, received_closed_disturb, received_verify },
 	{ "received-part", received_part_setup, received_part_disturb, received_verify },
 	{ "outside", outside_setup, close_disturb, received_verify },
+	{ "outside-open", outside_setup, nothing_disturb, received_verify },
+	{ "bus", bus_setup, nothing_disturb, bus_verify },
 	{ "unread", received_setup, send_the_rest, unread_verify },
 	{ "unread-half", received_half_setup, send_the_rest, unread_verify },
 	{ "options", options_setup, options_disturb, options_verify },

@@ -320,6 +320,7 @@ struct file {
 	bool tcp_coming, tcp_going;
 	bool accepted; /* at a restore: it is a server's (files_find_accepted())   */
 	bool goes_on;  /* at a restore: its other end was rolled back, too (files_group.c) */
+	bool strange;  /* at a restore: a Unix connection to a process outside of the app  */
 	/* What can be read from it, when its other end is the app's own as well   */
 	uint8_t *content; /* of messages: each with its length in front, uint32_t  */
 	uint32_t content_bytes;
@@ -532,6 +533,9 @@ bool file_unix_is_alone(const struct file_socket *socket);
 void file_look_at_node(int fd, struct file_socket *socket, pid_t init);
 /* Whether that file was deleted since. */
 bool file_unix_is_deleted(int fd, const struct file_socket *socket);
+/* Whether it is connected to a D-Bus: a program that asks one numbers its requests, and most end when
+ * they lose it. */
+bool file_unix_is_bus(const struct file_socket *socket);
 /* `template` resolves names as the app did. 0, or -1 and *why; *why may be set on success as well:
  * what differs. */
 int file_bind_unix(int fd, const struct file_socket *socket, pid_t template, pid_t init,

@@ -81,7 +81,8 @@ static void forget(int fd, const struct file *then, const struct avc_config *con
 	} else if (s->type == SOCK_DGRAM) {
 		if (s->domain != AF_UNIX || file_has_name(s))
 			(void)file_empty_socket(fd, false);
-	} else if (s->domain == AF_UNIX && s->connected && file_has_name(s)) {
+	} else if (s->domain == AF_UNIX && s->connected && file_has_name(s) &&
+		   !file_unix_is_bus(s)) {
 		shutdown(fd, SHUT_RDWR);
 		(void)file_empty_socket(fd, true);
 	} else if (s->protocol == IPPROTO_TCP && (s->connected || then->tcp_state) &&

@@ -198,6 +198,23 @@ static void give_up_useless(struct files_work *work)
 	}
 }
 
+/* The process outside is told at once: other generations have the connection open as well. */
+static void cut_strange(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		int fd;
+
+		if (!w->strange || work->source[i] < 0)
+			continue;
+		fd = proc_borrow_fd(work->table_pidfd, work->now->file[work->source[i]].fd);
+		if (fd >= 0)
+			shutdown(fd, SHUT_RDWR);
+		close_fd(&fd);
+		work->source[i] = -1;
+	}
+}
+
 /* Of a process of the app: it refers to a dead one. */
 static void give_up_own(struct files_work *work)
 {
@@ -856,6 +873,7 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
 	find_moved(work);
 	give_up_useless(work);
+	cut_strange(work);
 	give_up_own(work);
 	break_pairs(work);
 	return 0;

@@ -56,14 +56,28 @@ static bool is_connected(const struct file_socket *s)
 	       is_named(s->remote_bytes);
 }
 
-/* ---- looking ------------------------------------------------------------------- */
-
 static const char *base_of(const char *path)
 {
 	const char *slash = strrchr(path, '/');
 
 	return slash ? slash + 1 : path;
 }
+
+bool file_unix_is_bus(const struct file_socket *s)
+{
+	const struct sockaddr_un *remote = (const struct sockaddr_un *)&s->remote;
+	char name[sizeof remote->sun_path + 1] = "";
+	const char *base;
+
+	if (!is_named(s->remote_bytes))
+		return false;
+	memcpy(name, remote->sun_path, s->remote_bytes - offsetof(struct sockaddr_un, sun_path));
+	base = base_of(name[0] ? name : name + 1);
+	return !strcmp(base, "bus") || !strcmp(base, "system_bus_socket") ||
+	       !strncmp(base, "dbus-", 5);
+}
+
+/* ---- looking ------------------------------------------------------------------- */
 
 static int open_folder(int root, const char *path)
 {

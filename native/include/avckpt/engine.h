@@ -31,9 +31,10 @@ enum avc_files {
 	AVC_FILES_AUTO = 3    /* the same if one was written other than at its end */
 };
 
-/* Established TCP connections at a restore. */
+/* Established TCP connections at a restore, and Unix connections to processes outside, of which
+ * nobody counts the bytes. */
 enum avc_tcp {
-	AVC_TCP_RESET_MOVED = 0, /* those on which bytes moved since the checkpoint are reset */
+	AVC_TCP_RESET_MOVED = 0, /* those on which bytes may have moved since are reset */
 	AVC_TCP_RESET = 1,       /* are reset, and read as closed                  */
 	AVC_TCP_KEEP = 2,        /* go on                                          */
 	AVC_TCP_MESSAGES = 3     /* those that it leaves in the middle of a message */
