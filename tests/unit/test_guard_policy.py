@@ -196,19 +196,25 @@ def test_a_failed_checkpoint_leaves_what_is_held_unless_nothing_is_any_good() ->
     guard = Guarded()
     c, policy = guard.c, guard.policy
     hopeless = (c.AVC_UNSUPPORTED, c.AVC_DENIED, c.AVC_BUSY)
+
+    def missed(code: int, of_main: bool, at_s: float) -> bool:
+        return bool(c.policy_missed(policy, code, of_main, int(at_s * SECOND)))
+
     for code in range(c.AVC_RETRY + 1):
-        assert c.policy_missed(policy, code, True) == (code in hopeless)
-        assert c.policy_missed(policy, code, False) == (code in hopeless)  # nothing is held yet
+        assert missed(code, True, 1) == (code in hopeless)
+        assert missed(code, False, 1) == (code in hopeless)  # nothing is held yet
     guard.take()
-    # A child process may be gone at the next look: three times in a row, and then it is not.
-    assert [c.policy_missed(policy, c.AVC_UNSUPPORTED, False) for _ in range(3)] == [False, False, True]
+    # A child process may be gone at the next look: three times in a row, in more than a moment, and then it is not.
+    assert [missed(c.AVC_UNSUPPORTED, False, at_s) for at_s in (10, 13, 16)] == [False, False, True]
+    guard.take()
+    assert [missed(c.AVC_UNSUPPORTED, False, 20 + at_s) for at_s in (0, 0.02, 0.04, 0.9, 1.0)] == [False] * 4 + [True]
     # A debugger leaves some day.
-    assert not any(c.policy_missed(policy, c.AVC_BUSY, of_main) for of_main in (True, False) for _ in range(5))
+    assert not any(missed(c.AVC_BUSY, of_main, 30 + s) for of_main in (True, False) for s in range(5))
     guard.take()
-    assert c.policy_missed(policy, c.AVC_DENIED, True)
-    assert [c.policy_missed(policy, c.AVC_DENIED, False) for _ in range(2)] == [False, False]
-    assert not c.policy_missed(policy, c.AVC_DEADLINE, False)
-    assert c.policy_missed(policy, c.AVC_UNSUPPORTED, False)
+    assert missed(c.AVC_DENIED, True, 40)
+    assert [missed(c.AVC_DENIED, False, at_s) for at_s in (41, 42)] == [False, False]
+    assert not missed(c.AVC_DEADLINE, False, 43)
+    assert missed(c.AVC_UNSUPPORTED, False, 44)
 
 
 def pauses(guard: Guarded, next_try: Callable[[Any, int, int], int], count: int) -> list[float]:

@@ -269,7 +269,7 @@ void guard_tell_unstoppable(struct avc_guard *guard, const struct avc_error *err
 
 	if (guard->main.pid && !tree_scan(&guard->tree, &why))
 		(void)check_vfork(&guard->tree, &why);
-	if (policy_missed(&guard->policy, why.code, false))
+	if (policy_missed(&guard->policy, why.code, false, now_ns()))
 		guard_unprotect(guard, 0, &why);
 	else
 		guard_emit_error(guard, AVC_EVENT_MISSED, 0,
@@ -698,7 +698,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 			guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
 		return;
 	}
-	if (policy_missed(&guard->policy, error.code, error.pid == guard->main.pid)) {
+	if (policy_missed(&guard->policy, error.code, error.pid == guard->main.pid, now_ns())) {
 		if (!seccomp_must_suspend())
 			guard->next_ns = policy_refused(&guard->policy, guard->next_ns, now_ns());
 		guard_unprotect(guard, ticket, &error);

@@ -13,6 +13,7 @@
 #include "policy.h"
 
 #define MISSES_UNTIL_UNPROTECTED 3
+#define MISSES_NS (1000 * MS)
 #define MS UINT64_C(1000000)
 #define FIRST_NS (500 * MS)
 #define PROOF_NS (1000 * MS) /* an app that lives this long has made progress */
@@ -169,13 +170,17 @@ void policy_hold(struct policy *policy, struct policy_generation fresh)
 /* A child process may be gone at the next attempt: existing generations stay valid for a while.
  * While another process traces it there is no new one: a debugger, or a crash reporter (breakpad,
  * gdb) that the app has started, and whose report may be followed by a death. */
-bool policy_missed(struct policy *policy, enum avc_code code, bool of_main)
+bool policy_missed(struct policy *policy, enum avc_code code, bool of_main, uint64_t now)
 {
 	if (code == AVC_BUSY)
 		return !policy->count;
 	if (code != AVC_UNSUPPORTED && code != AVC_DENIED)
 		return false;
-	return of_main || !policy->count || ++policy->misses >= MISSES_UNTIL_UNPROTECTED;
+	if (of_main || !policy->count)
+		return true;
+	if (!policy->misses++)
+		policy->missed_ns = now;
+	return policy->misses >= MISSES_UNTIL_UNPROTECTED && now - policy->missed_ns >= MISSES_NS;
 }
 
 static uint64_t as_long_again(uint64_t *since, uint64_t least, uint64_t now)

@@ -38,10 +38,11 @@ struct policy_generation {
 struct policy {
 	struct policy_generation held[AVC_KEEP_MAX]; /* oldest first        */
 	uint32_t count;
-	uint32_t room;     /* generations that may be held now                */
-	uint32_t lineages; /* that have existed */
-	uint32_t misses;   /* in a row, because of a child process */
-	uint32_t restores; /* after a crash, not on command                   */
+	uint32_t room;      /* generations that may be held now                */
+	uint32_t lineages;  /* that have existed */
+	uint32_t misses;    /* in a row, because of a child process */
+	uint64_t missed_ns; /* the first of these                            */
+	uint32_t restores;  /* after a crash, not on command                   */
 	uint64_t restored_at[AVC_RESTORES_MAX]; /* the last of these        */
 	bool vouching;                          /* a health check says when the app is healthy */
 	/* The process that runs now. */
@@ -88,7 +89,7 @@ uint32_t policy_line_replaced(const struct policy *policy, const struct policy_l
 
 /* A checkpoint has failed because of the main process, or of another one.  True: no generation is
  * valid, the app is unprotected.  False: it is retried when it is due. */
-bool policy_missed(struct policy *policy, enum avc_code code, bool of_main);
+bool policy_missed(struct policy *policy, enum avc_code code, bool of_main, uint64_t now);
 /* It is unprotected: when to try again.  At `due` or after a second, and then after as long again as
  * it has been refused, up to a minute: what lasts for a moment costs little protection, even if the
  * interval is an hour, and an app that cannot be protected is hardly ever stopped. */
