@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Unix connections: what processes of one application have asked each other is rolled back with them; one with
-a process outside, which is not rolled back, is cut."""
+"""Connections: what processes of one application have asked each other is rolled back with them; a Unix connection
+with a process outside, which is not rolled back, is cut."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def built(init_built: None, victims_built: Path) -> None:
     """avckpt-init and the victims."""
 
 
-@pytest.mark.parametrize("command", ["stream", "record", "stream --again", "record --again"])
+@pytest.mark.parametrize("command", ["stream", "record", "stream --again", "record --again", "tcp", "tcp6"])
 def test_every_question_has_its_answer(command: str, tmp_path: Path) -> None:
     """The server is killed at random moments; its clients, which go back with it, wait for no lost answer."""
     rng = random.Random(1)

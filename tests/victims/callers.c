@@ -1,9 +1,9 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
  * Processes of one application that ask each other over Unix sockets connected by a name, as
- * clients of Python's multiprocessing managers, of D-Bus and X11 do.
+ * clients of Python's multiprocessing managers, of D-Bus and X11 do; or over TCP, as Dask does.
  *
- *   callers CLIENTS stream|record [--again] [PATH]
+ *   callers CLIENTS stream|record|tcp|tcp6 [--again] [PATH]
  *
  * The main process answers each number with the next one.  Each client is a child that asks, and
  * waits for its answer, all the time; with --again it hangs up after every tenth, and calls again.
@@ -13,6 +13,7 @@
  * With PATH the server there is another program, or with no CLIENTS the clients are: then connections
  * may end, of clients with an error.
  */
+#include <netinet/in.h>
 #include <poll.h>
 #include <stddef.h>
 #include <sys/socket.h>
@@ -22,17 +23,22 @@
 
 enum { CLIENTS_MAX = 32, ANSWERS_EACH = 10 };
 
-static struct sockaddr_un address = { .sun_family = AF_UNIX };
+static union {
+	struct sockaddr any;
+	struct sockaddr_un un;
+	struct sockaddr_in v4;
+	struct sockaddr_in6 v6;
+} address;
 static socklen_t address_bytes;
 static int type;
 static bool again, outside;
 
 static int call(void)
 {
-	const int fd = socket(AF_UNIX, type | SOCK_CLOEXEC, 0);
+	const int fd = socket(address.any.sa_family, type | SOCK_CLOEXEC, 0);
 
 	must(fd >= 0, "socket");
-	must(!connect(fd, (struct sockaddr *)&address, address_bytes), "connect");
+	must(!connect(fd, &address.any, address_bytes), "connect");
 	return fd;
 }
 
@@ -59,6 +65,9 @@ static void ask(int number)
 		CHECK(answer == asked + 1, "%lx is no answer to %lx", answer, asked);
 		asked = answer;
 		count((unsigned)number, 1);
+		/* Over the loopback without a pause, nobody else gets a CPU for seconds. */
+		if (address.any.sa_family != AF_UNIX)
+			usleep(500);
 		if (!again || ++answers % ANSWERS_EACH)
 			continue;
 		close(fd);
@@ -99,11 +108,24 @@ static void serve(struct pollfd *client, uint32_t room)
 	}
 }
 
-static void name_server(const char *path)
+static void name_server(const char *how, const char *path)
 {
-	char *name = address.sun_path;
-	size_t room = sizeof address.sun_path;
+	char *name = address.un.sun_path;
+	size_t room = sizeof address.un.sun_path;
 
+	if (!strcmp(how, "tcp")) {
+		address.v4.sin_family = AF_INET;
+		address.v4.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+		address_bytes = sizeof address.v4;
+		return;
+	}
+	if (!strcmp(how, "tcp6")) {
+		address.v6.sin6_family = AF_INET6;
+		address.v6.sin6_addr = in6addr_loopback;
+		address_bytes = sizeof address.v6;
+		return;
+	}
+	address.un.sun_family = AF_UNIX;
 	if (path)
 		name += snprintf(name, room, "%s", path);
 	else /* an abstract name, which no other has: the board's */
@@ -117,19 +139,19 @@ int main(int argc, char **argv)
 	int clients;
 
 	again = victim_flag(&argc, argv, "--again");
-	victim_start(&argc, argv, 2, "CLIENTS stream|record [--again] [PATH]");
+	victim_start(&argc, argv, 2, "CLIENTS stream|record|tcp|tcp6 [--again] [PATH]");
 	clients = atoi(argv[1]);
 	outside = argv[3];
 	must(clients >= !outside && clients <= CLIENTS_MAX, "CLIENTS");
 	type = strcmp(argv[2], "record") ? SOCK_STREAM : SOCK_SEQPACKET;
 	for (uint32_t i = 0; i < sizeof client / sizeof *client; i++)
 		client[i] = (struct pollfd){ .fd = -1, .events = POLLIN };
-	name_server(argv[3]);
+	name_server(argv[2], argv[3]);
 	if (!outside || !clients) {
-		client->fd = socket(AF_UNIX, type | SOCK_CLOEXEC, 0);
-		must(client->fd >= 0 &&
-			     !bind(client->fd, (struct sockaddr *)&address, address_bytes) &&
-			     !listen(client->fd, CLIENTS_MAX),
+		client->fd = socket(address.any.sa_family, type | SOCK_CLOEXEC, 0);
+		must(client->fd >= 0 && !bind(client->fd, &address.any, address_bytes) &&
+			     !listen(client->fd, CLIENTS_MAX) &&
+			     !getsockname(client->fd, &address.any, &address_bytes),
 		     "listen");
 	}
 	for (int i = 0; i < clients; i++)

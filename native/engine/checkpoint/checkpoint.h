@@ -105,7 +105,7 @@ struct generation {
 	char written[FILES_NAME];  /* what was written since; "": none                 */
 	struct spare spare;        /* of the main process                              */
 	struct restore_plan *plan; /* restore_plan.c; NULL: not begun                   */
-	struct group_ends *ends;   /* of connections in its group; NULL: none           */
+	struct group_ends *ends;   /* of connections in its group, or within it; NULL   */
 };
 
 /* ---- freeze.c ------------------------------------------------------------------ */

@@ -331,6 +331,8 @@ static int read_and_clone(struct freeze *freeze, struct avc_error *err)
 	/* The tables do not change while the kernel clones: no task runs.  While main threads are in
 	 * their parasites: see parasite_set_undo(). */
 	files_capture(generation->image, generation->images);
+	if (!freeze->meet)
+		generation->ends = files_ends_keep_own(generation->image, generation->images);
 	if (dirty_capture(freeze->dirty, generation, err))
 		return -1;
 	if (see_alive(freeze->tree, err))

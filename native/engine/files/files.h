@@ -148,6 +148,12 @@ void files_ends_show(struct group_ends *ends, struct image *image, uint32_t imag
 struct group_ended files_ends_mend(struct group_ends *ends, struct image *image, uint32_t images,
 				   const struct avc_config *config, struct avc_board *board);
 
+/* TCP connections of which both ends are the application's, without a group: it is stopped; later,
+ * it is dead.  The others are left alone.  NULL: there are none, or no memory. */
+struct group_ends *files_ends_keep_own(const struct image *image, uint32_t images);
+void files_ends_mend_own(struct group_ends *ends, struct image *image, uint32_t images,
+			 const struct avc_config *config);
+
 /* files_mapped.c: contents of files that are mapped for writing.  Before a freeze; NULL: out of
  * memory. */
 struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes);

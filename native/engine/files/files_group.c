@@ -55,6 +55,7 @@ struct group_end {
 };
 
 struct group_ends {
+	bool alone; /* without a group: what cannot be kept is left to the restore */
 	uint32_t count;
 	struct group_end end[ENDS_MAX];
 };
@@ -226,16 +227,50 @@ static void show(struct group_end *end, struct avc_board *board, uint64_t writte
 	end->shown = (int)at;
 }
 
-/* NULL: there is none, or more than one. */
-static const struct avc_end *find_other(const struct group_end *end, const struct avc_board *board)
+/* The board's ends by their names: there may be thousands, and everything is stopped. */
+struct named_ends {
+	const struct avc_end **end;
+	uint32_t count;
+};
+
+static int by_name(const void *a, const void *b)
+{
+	const struct avc_end *x = *(const struct avc_end *const *)a;
+	const struct avc_end *y = *(const struct avc_end *const *)b;
+
+	return memcmp(&x->own, &y->own, sizeof x->own);
+}
+
+/* When all are on it.  Without memory: as if none were. */
+static struct named_ends sort_board(const struct avc_board *board)
 {
 	const uint32_t all = __atomic_load_n(&board->ends, __ATOMIC_ACQUIRE);
+	struct named_ends named = { .count = all < AVC_BOARD_ENDS ? all : AVC_BOARD_ENDS };
+
+	named.end = malloc((named.count + 1) * sizeof(void *));
+	if (!named.end)
+		named.count = 0;
+	for (uint32_t i = 0; i < named.count; i++)
+		named.end[i] = &board->end[i];
+	if (named.end)
+		qsort(named.end, named.count, sizeof(void *), by_name);
+	return named;
+}
+
+/* NULL: there is none, or more than one. */
+static const struct avc_end *find_other(const struct group_end *end, const struct avc_board *board,
+					const struct named_ends *named)
+{
 	const struct avc_end *found = NULL;
+	uint32_t at = LOWER_BOUND(named->count, i,
+				  memcmp(&named->end[i]->own, &end->other, sizeof end->other) < 0);
 
-	for (uint32_t i = 0; i < all && i < AVC_BOARD_ENDS; i++) {
-		const struct avc_end *other = &board->end[i];
+	for (; at < named->count; at++) {
+		const struct avc_end *other = named->end[at];
 
-		if ((int)i == end->shown || memcmp(&other->own, &end->other, sizeof end->own) ||
+		if (memcmp(&other->own, &end->other, sizeof end->other))
+			break;
+		if (other == &board->end[end->shown] ||
 		    memcmp(&other->other, &end->own, sizeof end->own))
 			continue;
 		if (found)
@@ -257,6 +292,72 @@ static void drop_end(struct group_end *end)
 {
 	close_fd(&end->fd);
 	end->shown = -1;
+}
+
+/* ---- both ends of one application ----------------------------------------------------------- */
+
+#define PAIR_BITS (UINT32_C(1) << 16)
+
+struct pairs {
+	uint64_t bit[PAIR_BITS / 64];
+};
+
+static bool port_of(const struct sockaddr_storage *address, uint32_t *port)
+{
+	if (address->ss_family == AF_INET)
+		*port = ntohs(((const struct sockaddr_in *)address)->sin_port);
+	else if (address->ss_family == AF_INET6)
+		*port = ntohs(((const struct sockaddr_in6 *)address)->sin6_port);
+	else
+		return false;
+	return true;
+}
+
+static uint32_t pair_bit(uint32_t from, uint32_t to)
+{
+	return (from * 40503 + to) % PAIR_BITS;
+}
+
+static bool is_own(const struct file *f, uint32_t *own, uint32_t *other)
+{
+	return may_go_on(f) && f->socket->domain != AF_UNIX && port_of(&f->socket->local, own) &&
+	       port_of(&f->socket->remote, other);
+}
+
+/* A server may have thousands of connections, and the application is stopped: so this compares no
+ * end with all others.  Those that only seem to have another one have none on the board. */
+static bool has_other(const struct file *f, const struct pairs *pairs)
+{
+	uint32_t own, other, bit;
+
+	if (!is_own(f, &own, &other))
+		return false;
+	bit = pair_bit(other, own);
+	return pairs->bit[bit / 64] >> bit % 64 & 1;
+}
+
+static bool find_pairs(struct pairs *pairs, const struct image *image, uint32_t images)
+{
+	for (uint32_t i = 0; i < images; i++) {
+		const struct files *files = image[i].process ? image[i].files : NULL;
+
+		for (uint32_t k = 0; files && k < files->count; k++) {
+			uint32_t own, other, bit;
+
+			if (!is_own(&files->file[k], &own, &other))
+				continue;
+			bit = pair_bit(own, other);
+			pairs->bit[bit / 64] |= UINT64_C(1) << bit % 64;
+		}
+	}
+	for (uint32_t i = 0; i < images; i++) {
+		const struct files *files = image[i].process ? image[i].files : NULL;
+
+		for (uint32_t k = 0; files && k < files->count; k++)
+			if (has_other(&files->file[k], pairs))
+				return true;
+	}
+	return false;
 }
 
 /* ---- a line ------------------------------------------------------------------------------------ */
@@ -369,10 +470,12 @@ static bool keep_bytes(struct group_end *end, uint64_t bytes)
 void files_ends_keep(struct group_ends *ends, struct avc_board *board)
 {
 	const uint64_t until = now_ns() + COMES_NS;
+	const struct named_ends named = sort_board(board);
 
 	for (uint32_t i = 0; ends && i < ends->count; i++) {
 		struct group_end *end = &ends->end[i];
-		const struct avc_end *other = end->shown < 0 ? NULL : find_other(end, board);
+		const struct avc_end *other = end->shown < 0 ? NULL
+							     : find_other(end, board, &named);
 		uint64_t unread = 0;
 		int waiting = 0;
 
@@ -395,6 +498,36 @@ void files_ends_keep(struct group_ends *ends, struct avc_board *board)
 		}
 		drop_end(end);
 	}
+	free(named.end);
+}
+
+static void add_own(struct group_ends *ends, const struct image *image, const struct pairs *pairs,
+		    struct avc_board *board)
+{
+	const struct files *files = image->process ? image->files : NULL;
+
+	for (uint32_t k = 0; files && k < files->count; k++)
+		if (has_other(&files->file[k], pairs))
+			add_end(ends, &files->file[k], image->process->pidfd, board);
+}
+
+struct group_ends *files_ends_keep_own(const struct image *image, uint32_t images)
+{
+	struct pairs pairs = { 0 };
+	struct group_ends *ends;
+	struct avc_board *board;
+
+	if (!find_pairs(&pairs, image, images))
+		return NULL;
+	ends = calloc(1, sizeof *ends);
+	board = calloc(1, sizeof *board); /* only what is used takes memory */
+	if (ends && board) {
+		for (uint32_t i = 0; i < images; i++)
+			add_own(ends, &image[i], &pairs, board);
+		files_ends_keep(ends, board);
+	}
+	free(board);
+	return ends;
 }
 
 void files_ends_free(struct group_ends *ends)
@@ -487,7 +620,7 @@ void files_ends_show(struct group_ends *ends, struct image *image, uint32_t imag
 			    files_leader(files, f) != k)
 				continue;
 			end = find_end(ends, f->ino);
-			if (end && end->fd >= 0)
+			if (end ? end->fd >= 0 : ends && ends->alone)
 				continue;
 			fd = borrow(pidfd, f);
 			if (fd < 0)
@@ -538,9 +671,10 @@ static enum mend_state mend(struct group_end *end, const struct avc_end *other,
 }
 
 /* Other guards can change the board at any time, so it is read only once. */
-static bool begin_mend(struct group_end *end, struct avc_end *copy, const struct avc_board *board)
+static bool begin_mend(struct group_end *end, struct avc_end *copy, const struct avc_board *board,
+		       const struct named_ends *named)
 {
-	const struct avc_end *other = end->shown < 0 ? NULL : find_other(end, board);
+	const struct avc_end *other = end->shown < 0 ? NULL : find_other(end, board, named);
 	uint64_t ignored, received = 0, unread = 0;
 
 	if (!other)
@@ -627,9 +761,11 @@ struct group_ended files_ends_mend(struct group_ends *ends, struct image *image,
 	struct avc_end *others = ends ? calloc(ends->count + 1, sizeof *others) : NULL;
 	enum mend_state *states = ends ? calloc(ends->count + 1, sizeof *states) : NULL;
 	struct group_ended ended = { 0 };
+	const struct named_ends named = sort_board(board);
 
 	for (uint32_t i = 0; others && states && i < ends->count; i++)
-		states[i] = ends->end[i].fd >= 0 && begin_mend(&ends->end[i], &others[i], board)
+		states[i] = ends->end[i].fd >= 0 &&
+					    begin_mend(&ends->end[i], &others[i], board, &named)
 				    ? MENDING
 				    : APART;
 	if (others && states)
@@ -645,14 +781,30 @@ struct group_ended files_ends_mend(struct group_ends *ends, struct image *image,
 		} else if (state != APART && is_tcp(end)) {
 			end->why = "what was in flight could not be put back";
 			(void)file_reset_tcp(end->fd);
-		} else {
+		} else if (!ends->alone) {
 			forget(end->fd, end->file, config);
 		}
 		if (!end->over && has_ended(end->fd))
 			say_why(&ended, end);
 		drop_end(end);
 	}
+	free(named.end);
 	free(others);
 	free(states);
 	return ended;
+}
+
+void files_ends_mend_own(struct group_ends *ends, struct image *image, uint32_t images,
+			 const struct avc_config *config)
+{
+	struct avc_board *board = ends && config->tcp != AVC_TCP_RESET ? calloc(1, sizeof *board)
+								       : NULL;
+
+	if (!board)
+		return;
+	ends->alone = true;
+	files_ends_show(ends, image, images, config, board);
+	(void)files_ends_mend(ends, image, images, config, board);
+	ends->alone = false;
+	free(board);
 }

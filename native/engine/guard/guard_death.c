@@ -299,6 +299,9 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 		 * limited, they count, as spares do. */
 		if (ending)
 			guard_wait_ended(guard);
+		if (!together)
+			files_ends_mend_own(generation->ends, generation->image, generation->images,
+					    &config);
 		init_channel_working(&guard->channel);
 		(void)last_pid_lock(guard->channel.numbers_fd, true);
 		guard->helper = NULL; /* restore_app() ends it */
