@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
-import platform
 import random
 import select
 import signal
@@ -27,7 +25,7 @@ from testkit.cgroups import Cgroup, freezer, throttle
 from testkit.family import ours
 from testkit.guarded import BUILD, PATIENCE_S, GuardProcess, Victim, config, forks_beside, sleep_exactly
 from testkit.harness import wait_until
-from testkit.procfs import children_of
+from testkit.procfs import KCMP_VM, children_of, share
 
 pytestmark = pytest.mark.shared_machine(
     "init waits two seconds for its guard, which may get no CPU for as long; "
@@ -335,12 +333,6 @@ def test_paused_before_it_is_made(version: int, pause_s: float, tmp_path: Path) 
         assert not [event for event in guard.events if event.get("kind") == "dropped"]
 
 
-def shares_memory(a: int, b: int) -> bool:
-    """kcmp(2) with KCMP_VM."""
-    number = {"x86_64": 312, "aarch64": 272}[platform.machine()]
-    return bool(ctypes.CDLL(None).syscall(number, a, b, 1, 0, 0) == 0)
-
-
 def test_made_late_it_is_used(tmp_path: Path) -> None:
     """Its template was frozen meanwhile; the restored process shares that template's memory until it is ended."""
     pause = freezer(2)
@@ -356,7 +348,7 @@ def test_made_late_it_is_used(tmp_path: Path) -> None:
             victim.kill_app()
             until = time.monotonic() + 1
             while not shared and time.monotonic() < until:
-                shared = any(shares_memory(late, pid) for pid in children_of(victim.pid) if pid != late)
+                shared = any(share(KCMP_VM, late, pid) for pid in children_of(victim.pid) if pid != late)
             guard.wait("restored", since=since)
             victim.wait_beats(5)
             if shared:

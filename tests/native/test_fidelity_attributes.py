@@ -12,6 +12,7 @@ from avckpt.guard import Images
 
 from testkit.guarded import BUILD, WHERE, GuardProcess, Victim, config, kill_at_random
 from testkit.harness import wait_until
+from testkit.procfs import KCMP_SYSVSEM, share
 
 
 @pytest.fixture(autouse=True)
@@ -154,3 +155,11 @@ def test_a_seccomp_filter_of_its_own(tmp_path: Path) -> None:
         kill_at_random(guard, victim, 30, (0.01, 0.12))
         for task in Path(f"/proc/{victim.app}/task").iterdir():
             assert "Seccomp:\t2\nSeccomp_filters:\t1\n" in (task / "status").read_text()
+
+
+def test_a_child_has_no_list_of_semaphores(tmp_path: Path) -> None:
+    """Neither it nor its parent has one to be undone, which kcmp(2) shows as the same; so it stays."""
+    with Victim("traits personality --in-child", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        assert share(KCMP_SYSVSEM, victim.app, victim.player)
+        assert guard.checkpoint()["kind"] == "checkpoint"
+        assert share(KCMP_SYSVSEM, victim.app, victim.player)

@@ -247,8 +247,9 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 		       struct avc_error *err)
 {
 	const uint64_t all = ~UINT64_C(0);
-	const uint64_t shared = porter->is_thread
-					? CLONE_THREAD | CLONE_SIGHAND | CLONE_FS | CLONE_SYSVSEM
+	/* Not CLONE_SYSVSEM: the kernel would give the process a list of semaphores to be undone, which
+	 * stays, and which kcmp(2) can tell from that of its parent: none. */
+	const uint64_t shared = porter->is_thread     ? CLONE_THREAD | CLONE_SIGHAND | CLONE_FS
 				: process->descendant ? 0
 						      : CLONE_PARENT | SIGCHLD;
 	const uint64_t arg[6] = { CLONE_VM | CLONE_FILES | shared };
