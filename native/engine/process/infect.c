@@ -676,7 +676,7 @@ int process_infect(struct process *process, uint32_t slots, timer_t timer, uint6
 		thread = stop_main(process, err);
 	result = thread ? infect_thread(process, thread, slots, err) : -1;
 	if (thread)
-		thread_release(process, thread);
+		write_finish(process, thread, writes_end());
 	tracee_deadline_clear(timer);
 	rt_priority_end();
 	return result;

@@ -10,6 +10,7 @@
  *   watcher.c       ... where its container may not watch memory
  *   support.c       what cannot be protected; quiescence
  *   waits.c         ends calls whose timeout has expired
+ *   writes.c        goes on with a write that a stop has cut short
  *   dying.c         in its own handler of a fatal signal
  *   fence.c         ... or in a Landlock domain of its own
  *   tree.c          all of them
@@ -140,6 +141,8 @@ bool process_interrupt(struct process *process, bool real_time);
 int process_await(struct process *process, struct avc_error *err) warn_unused;
 int process_stop_all(struct process *process, struct avc_error *err) warn_unused;
 void process_let_go(struct process *process);
+/* All but those whose write is cut short (writes.c); writes_finish() is for them. */
+void process_let_go_uncut(struct process *process);
 
 /* ---- infect.c ----------------------------------------------------------------- */
 
@@ -272,5 +275,15 @@ void tree_free(struct tree *tree);
 void waits_prepare(struct process *process);
 /* Ends rewound calls whose time is up; the next is due at process->due_ns (UINT64_MAX: none). */
 void waits_end(struct process *process, timer_t timer);
+
+/* ---- writes.c ---------------------------------------------------------------------- */
+
+/* Whether the thread has been stopped in a write(2) and has not written everything. */
+bool write_is_cut(const struct thread *thread);
+/* Releases a thread; before that, until `end`, writes the rest if it was into a pipe. */
+void write_finish(struct process *process, struct thread *thread, uint64_t end);
+/* The same for all; those that read may have to run for it. */
+void writes_finish(struct process *process, uint64_t end);
+uint64_t writes_end(void);
 
 #endif
