@@ -29,7 +29,9 @@ def test_a_write_is_not_cut_short(where: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_every_byte_is_written_once(where: str, tmp_path: Path) -> None:
-    """Of writes that were waiting for room in a pipe at the checkpoint, and went on in the running application."""
-    with Victim(f"lengthy {where}", tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
+@pytest.mark.parametrize("reader", ["", "--hang-up"])
+def test_every_byte_is_written_once(reader: str, where: str, tmp_path: Path) -> None:
+    """Of writes that were waiting for room in a pipe at the checkpoint, and went on in the running application;
+    its reader may go away."""
+    with Victim(f"lengthy {reader} {where}", tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
         kill_at_random(guard, victim, 12, (0.01, 0.12))

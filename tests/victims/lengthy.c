@@ -3,6 +3,9 @@
  * lengthy: the main thread writes far more than fits into a pipe with each write(2), and so waits in
  * that call nearly all the time, for a thread that reads.  Every byte has to arrive once.
  *
+ * With --hang-up the reader closes each pipe after a part of it: the write returns that, and the next
+ * one fails.
+ *
  * counter[0]: such writes; counter[1]: those that returned before everything was written
  */
 #include <pthread.h>
@@ -14,6 +17,7 @@
 #define PAUSE_US 200
 
 static int ends[2];
+static bool hangs_up;
 static uint8_t written[BYTES];
 
 static void *take(void *arg)
@@ -29,31 +33,53 @@ static void *take(void *arg)
 		for (ssize_t i = 0; i < n; i++, at = (at + 1) % BYTES)
 			CHECK(got[i] == written[at], "another byte came at %zu", at);
 		nap_us(PAUSE_US);
+		if (hangs_up && at > BYTES / 2) {
+			close(ends[0]);
+			return NULL;
+		}
 	}
-	return NULL;
+}
+
+static void begin(void)
+{
+	pthread_t reader;
+
+	must(pipe(ends) == 0, "pipe");
+	must(pthread_create(&reader, NULL, take, NULL) == 0, "pthread_create");
+	pthread_detach(reader);
+}
+
+static bool write_all(void)
+{
+	size_t done = 0;
+
+	while (done < BYTES) {
+		const ssize_t n = write(ends[1], written + done, BYTES - done);
+
+		if (hangs_up && n < 0 && errno == EPIPE) {
+			close(ends[1]);
+			return false;
+		}
+		CHECK(n > 0, "write: %zd, %s", n, strerror(errno));
+		done += (size_t)n;
+		if (done < BYTES)
+			count(1, 1);
+	}
+	return true;
 }
 
 int main(int argc, char **argv)
 {
-	pthread_t reader;
-
-	victim_start(&argc, argv, 0, "");
+	hangs_up = victim_flag(&argc, argv, "--hang-up");
+	victim_start(&argc, argv, 0, "[--hang-up]");
+	signal(SIGPIPE, SIG_IGN);
 	for (size_t i = 0; i < BYTES; i++)
 		written[i] = (uint8_t)(i * 2654435761U >> 13);
-	must(pipe(ends) == 0, "pipe");
-	must(pthread_create(&reader, NULL, take, NULL) == 0, "pthread_create");
+	begin();
 	victim_ready();
 	for (;;) {
-		size_t done = 0;
-
-		while (done < BYTES) {
-			const ssize_t n = write(ends[1], written + done, BYTES - done);
-
-			CHECK(n > 0, "write: %zd, %s", n, strerror(errno));
-			done += (size_t)n;
-			if (done < BYTES)
-				count(1, 1);
-		}
+		if (!write_all())
+			begin();
 		count(0, 1);
 		beat();
 	}

@@ -416,7 +416,7 @@ static void let_go(struct freeze *freeze)
 			thread_let_go(main, main_thread);
 	}
 	for (uint32_t i = 0; i < freeze->tree->processes; i++)
-		process_let_go_uncut(freeze->tree->process[i]);
+		process_let_go(freeze->tree->process[i]);
 }
 
 /* Everything else runs again: their readers, too. */
@@ -425,7 +425,7 @@ static void finish_writes(struct freeze *freeze)
 	const uint64_t end = writes_end();
 
 	for (uint32_t i = 0; i < freeze->tree->processes; i++)
-		writes_finish(freeze->tree->process[i], end);
+		writes_finish_until(freeze->tree->process[i], end);
 }
 
 int freeze_tree(struct freeze *freeze, struct avc_error *err)

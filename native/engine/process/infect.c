@@ -657,6 +657,7 @@ static int do_stopped(struct process *process, uint32_t slots, timer_t timer, ui
 	process_let_go(process);
 	tracee_deadline_clear(timer);
 	rt_priority_end();
+	writes_finish(process);
 	return result;
 }
 
@@ -675,10 +676,11 @@ int process_infect(struct process *process, uint32_t slots, timer_t timer, uint6
 	if (process_check_dying(process, err) == 0)
 		thread = stop_main(process, err);
 	result = thread ? infect_thread(process, thread, slots, err) : -1;
-	if (thread)
-		write_finish(process, thread, writes_end());
+	if (thread && !write_is_cut(thread))
+		thread_let_go(process, thread);
 	tracee_deadline_clear(timer);
 	rt_priority_end();
+	writes_finish(process);
 	return result;
 }
 
@@ -795,6 +797,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 		process_let_go(process);
 		tracee_deadline_clear(timer);
 		rt_priority_end();
+		writes_finish(process);
 		return -1;
 	}
 	call_begin(call, INJ_AFTER_HOME);
@@ -813,6 +816,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	process_let_go(process);
 	tracee_deadline_clear(timer);
 	rt_priority_end();
+	writes_finish(process);
 	if (!holder)
 		return -1;
 	/* It must never run by itself: its stack is the app's memory. */

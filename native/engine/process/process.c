@@ -526,6 +526,7 @@ int process_query_new_threads(struct process *process, timer_t timer, uint64_t d
 		process_let_go(process);
 		tracee_deadline_clear(timer);
 		rt_priority_end();
+		writes_finish(process);
 	}
 	threads_forget_unseen(process);
 	qsort(process->threads, process->thread_count, sizeof *process->threads, by_inside);

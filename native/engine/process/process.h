@@ -140,9 +140,8 @@ void process_stop_begin(struct process *process);
 bool process_interrupt(struct process *process, bool real_time);
 int process_await(struct process *process, struct avc_error *err) warn_unused;
 int process_stop_all(struct process *process, struct avc_error *err) warn_unused;
+/* All but those whose write is cut short: writes_finish() is for them. */
 void process_let_go(struct process *process);
-/* All but those whose write is cut short (writes.c); writes_finish() is for them. */
-void process_let_go_uncut(struct process *process);
 
 /* ---- infect.c ----------------------------------------------------------------- */
 
@@ -280,10 +279,11 @@ void waits_end(struct process *process, timer_t timer);
 
 /* Whether the thread has been stopped in a write(2) and has not written everything. */
 bool write_is_cut(const struct thread *thread);
-/* Releases a thread; before that, until `end`, writes the rest if it was into a pipe. */
-void write_finish(struct process *process, struct thread *thread, uint64_t end);
-/* The same for all; those that read may have to run for it. */
-void writes_finish(struct process *process, uint64_t end);
+/* After process_let_go(): releases these threads as well; before that, writes the rest if it was into a
+ * pipe.  Everything else runs, those that read, too; takes a second at most. */
+void writes_finish(struct process *process);
+/* The same for several, all of them until writes_end(). */
+void writes_finish_until(struct process *process, uint64_t end);
 uint64_t writes_end(void);
 
 #endif

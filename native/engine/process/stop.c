@@ -164,7 +164,7 @@ int process_stop(struct process *process, struct avc_error *err)
 	return process_stop_all(process, err);
 }
 
-void process_let_go_uncut(struct process *process)
+void process_let_go(struct process *process)
 {
 	process->filters_seen = false; /* they may have got some while they were being stopped */
 	for (uint32_t i = 0; i < process->thread_count; i++)
@@ -173,10 +173,4 @@ void process_let_go_uncut(struct process *process)
 	for (uint32_t i = 0; i < process->thread_count; i++)
 		if (!write_is_cut(&process->threads[i]))
 			thread_let_go(process, &process->threads[i]);
-}
-
-void process_let_go(struct process *process)
-{
-	process_let_go_uncut(process);
-	writes_finish(process, writes_end());
 }

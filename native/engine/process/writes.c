@@ -101,7 +101,7 @@ static void write_rest(const struct process *process, struct thread *thread, int
 	}
 }
 
-void write_finish(struct process *process, struct thread *thread, uint64_t end)
+static void finish(struct process *process, struct thread *thread, uint64_t end)
 {
 	int fd = -1;
 
@@ -119,8 +119,13 @@ uint64_t writes_end(void)
 	return now_ns() + WRITES_NS;
 }
 
-void writes_finish(struct process *process, uint64_t end)
+void writes_finish_until(struct process *process, uint64_t end)
 {
 	for (uint32_t i = 0; i < process->thread_count; i++)
-		write_finish(process, &process->threads[i], end);
+		finish(process, &process->threads[i], end);
+}
+
+void writes_finish(struct process *process)
+{
+	writes_finish_until(process, writes_end());
 }
