@@ -70,15 +70,15 @@ bool file_empty_socket(int fd, bool ends)
 	return any;
 }
 
-static bool end_connection(int fd, int domain)
+static bool end_connection(int fd, int domain, const struct file *file)
 {
 	if (!has_bytes(fd))
 		return false;
-	return domain == AF_INET || domain == AF_INET6 ? !file_reset_tcp(fd)
+	return domain == AF_INET || domain == AF_INET6 ? !file_lose_tcp(fd, file)
 						       : shutdown(fd, SHUT_RDWR) == 0;
 }
 
-static bool drop_from_socket(int fd, bool inside)
+static bool drop_from_socket(int fd, const struct file *file, bool inside)
 {
 	const int type = file_option(fd, SOL_SOCKET, SO_TYPE),
 		  domain = file_option(fd, SOL_SOCKET, SO_DOMAIN);
@@ -86,7 +86,7 @@ static bool drop_from_socket(int fd, bool inside)
 	if (file_option(fd, SOL_SOCKET, SO_ACCEPTCONN) > 0)
 		return file_turn_away(fd);
 	if (type == SOCK_STREAM && !inside)
-		return end_connection(fd, domain);
+		return end_connection(fd, domain, file);
 	return file_empty_socket(fd, type == SOCK_STREAM || type == SOCK_SEQPACKET);
 }
 
@@ -110,7 +110,7 @@ bool file_drop_input(int fd, const struct file *file, bool inside)
 	case FILE_FIFO:
 		return (file->flags & O_ACCMODE) != O_WRONLY && drop_from_pipe(fd);
 	case FILE_SOCKET:
-		return drop_from_socket(fd, inside);
+		return drop_from_socket(fd, file, inside || file->goes_on);
 	default:
 		return false;
 	}

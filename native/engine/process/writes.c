@@ -66,7 +66,9 @@ static ssize_t write_some(const struct process *process, int fd, uint64_t from, 
 {
 	static uint8_t chunk[CHUNK_BYTES];
 	struct iovec io = { chunk, bytes < CHUNK_BYTES ? bytes : CHUNK_BYTES };
-	ssize_t n = pread(process->mem_fd, chunk, io.iov_len, (off_t)from);
+	const struct iovec there = { (void *)from, io.iov_len };
+	ssize_t n = process_vm_readv(process->pid, &io, 1, &there, 1,
+				     0); /* what it can read itself */
 
 	if (n <= 0)
 		return -1;
