@@ -225,6 +225,20 @@ def test_a_roll_back_is_manual_and_a_refused_command_is_told(local: LocalSidecar
 
 
 @SHARED
+def test_roll_backs_on_command_are_no_crashes(local: LocalSidecar) -> None:
+    web = local.protected("web", SLEEPER, ON_COMMAND)
+    local.wait_for(web, app_pid_inside=2)
+    take_checkpoint(local.client, "web")
+    for _ in range(2):
+        assert json.loads(local.avckpt("restore", "web", "--json").stdout)["event"]["attempt"] == 0
+    crash(local, web, 3)
+    restored = json.loads(local.avckpt("restore", "web", "--json").stdout)["event"]
+    assert (restored["attempt"], restored["restores"]) == (1, 4)
+    (row,) = local.client.containers()
+    assert "keeps crashing" not in row["reason"]
+
+
+@SHARED
 def test_the_end_of_a_container_is_told(local: LocalSidecar) -> None:
     web = local.protected("web", ["sh", "-c", "exec sleep 1000"])
     local.wait_for(web, state="protected")

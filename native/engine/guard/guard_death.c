@@ -259,8 +259,9 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 	event.reason = reason;
 	event.wait_status = report->status;
 	event.died_ns = report->reaped_ns;
+	/* note_restore() counts this one, too, but none on command. */
 	event.attempt = policy_restores_within(&guard->policy, &guard->config, now_ns()) +
-			(reason != AVC_REASON_GROUP);
+			!is_command(reason);
 	if (together)
 		ready_helper(guard); /* the newest may have changed since the death */
 	/* In a group only this one: an older one belongs to another line. */

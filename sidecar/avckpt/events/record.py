@@ -75,7 +75,8 @@ class EventRecord:
     restore_s: float | None = said("from the death until the last thread runs again")
     threads: int | None = said("threads of the checkpoint or restore")
     attempt: int | None = said(
-        "restores within the period of avckpt.restore.max, this one included; of a dropped generation: its crashes"
+        "restores within the period of avckpt.restore.max, this one included unless it was on command or for its "
+        "group; of a dropped generation: its crashes"
     )
     restores: int | None = said("restores since the sidecar began to protect this run of the container")
     again: str | None = said("what this restore has changed (avckpt.restore.again): `drop-input`, `stagger`")
