@@ -178,7 +178,7 @@ class Daemon:
             nodes = units.UnitListener(self.run_dir / "units" / "units.sock", self._register_unit)
             looking = loop.create_task(self._keep_catching_up())
             log.info("avckpt %s is ready, %d container(s) found", __version__, len(self._watches))
-            outage = self._presence.since_then(self.registry.live())
+            outage = self._presence.since_then(self.registry.live(), self.records.has)
             if outage:
                 self._tell_of_itself(Kind.SIDECAR_STARTED, outage)
             await stop.wait()

@@ -417,6 +417,10 @@ def test_a_sidecar_that_does_not_see_the_hosts_processes_says_so(local: LocalSid
         assert f"new runs unprotected: the sidecar said: {why}" in said
         assert f"old: runs unprotected: {why}" in local.log
         assert record.exists()
+        [told] = [each for each in Client(local.run_dir).history() if each["kind"] == "sidecar_started"]
+        assert "old" not in told["message"]  # nobody knows that it has ended
+        doctor = local.avckpt("doctor", check=False).stdout
+        assert "fail  sidecar: it does not see the host's processes" in doctor
     finally:
         blind.kill()
         blind.wait()

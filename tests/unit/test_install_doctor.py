@@ -35,6 +35,7 @@ GOOD = Facts(
     sidecar_version=avckpt.__version__,
     sidecar_problem="",
     sidecar_outdated=False,
+    sidecar_blind=False,
     engine_problem="",
     config=ConfigFacts("/etc/avckpt/config.yaml", True, ""),
 )
@@ -103,6 +104,7 @@ def test_a_good_machine() -> None:
         ({"config": ConfigFacts("/c", False, "")}, "config", "ok", "no /c: the built-in defaults hold", ""),
         ({"sidecar_version": None, "sidecar_problem": "is away: start it"}, "sidecar", "fail", "is away", "start it"),
         ({"sidecar_version": "0.0.1"}, "sidecar", "warn", "version 0.0.1", "build its image again"),
+        ({"sidecar_blind": True}, "sidecar", "fail", "does not see the host's processes", "--pid=host"),
         ({"sidecar_outdated": True}, "sidecar", "warn", "of another build", "podman run -d --replace"),
     ],
 )

@@ -8,6 +8,7 @@ import http.client
 import json
 import os
 import socket
+import struct
 from collections.abc import Iterator
 from http import HTTPStatus
 from pathlib import Path
@@ -74,6 +75,15 @@ class Client:
     def info(self) -> Json:
         """Version and state of the sidecar."""
         return self._request("GET", "/v1/info")
+
+    def pid(self) -> int:
+        """The sidecar's PID as it is here; in `info()` it is that of its own PID namespace."""
+        with self._connected(ANSWER_S) as connection:
+            connection.connect()
+            peer: tuple[int, int, int] = struct.unpack(
+                "3i", connection.sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
+            )
+        return peer[0]
 
     def containers(self, *, ended: bool = False, memory: bool = True) -> list[Json]:
         """The protected containers, with `ended` also the last few that are gone.

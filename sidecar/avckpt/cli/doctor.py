@@ -105,6 +105,8 @@ class Facts:
     sidecar_problem: str
     sidecar_outdated: bool
     """Its container was made of another image than there is now."""
+    sidecar_blind: bool
+    """It is in a PID namespace of its own, where it sees no container's processes."""
     engine_problem: str
     """What the engine's own probe said; empty: it is content."""
     config: ConfigFacts
@@ -295,6 +297,9 @@ def _judge_sidecar(facts: Facts) -> Check:
     if facts.sidecar_version is None:
         what, _, remedy = facts.sidecar_problem.partition(": ")
         return Check("sidecar", Status.FAIL, what, remedy)
+    if facts.sidecar_blind:
+        what = "it does not see the host's processes, and protects nothing"
+        return Check("sidecar", Status.FAIL, what, f"start it with --pid=host: {run_it(_run_dir())}")
     if facts.sidecar_version != avckpt.__version__:
         return Check(
             "sidecar",
@@ -344,6 +349,7 @@ def gather() -> Facts:
         sidecar_version=str(info["version"]) if info else None,
         sidecar_problem=problem,
         sidecar_outdated=_sidecar_outdated(),
+        sidecar_blind=_sidecar_blind(info),
         engine_problem=_engine_problem(),
         config=_config(info),
         root=os.geteuid() == 0,
@@ -470,6 +476,18 @@ def _sidecar_outdated() -> bool:
         return sidecar_container.is_outdated()
     except AvckptError:
         return False  # no Podman here, of which more is said elsewhere
+
+
+def _sidecar_blind(info: dict[str, Any]) -> bool:
+    from avckpt.cli.client import Client
+
+    if "pid" not in info:
+        return False
+    try:
+        here = Client(_run_dir()).pid()
+    except (AvckptError, OSError):
+        return False  # it has just gone
+    return here not in (0, info["pid"])  # 0: we are the ones who do not see it
 
 
 def _config(info: dict[str, Any]) -> ConfigFacts:

@@ -9,7 +9,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from avckpt_hooks.shared.files import read_bounded, write_at_once
@@ -53,19 +53,19 @@ class Presence:
         """Records that we exit on request."""
         self.keep(live, stopped=True)
 
-    def since_then(self, live: Iterable[Protected]) -> str:
+    def since_then(self, live: Iterable[Protected], is_recorded: Callable[[str], bool]) -> str:
         """How long there was no sidecar, why, and which containers have ended meanwhile; "": this is the
-        first one.
+        first one. Of one that `is_recorded` without being live nobody knows: it could not be adopted.
 
         Then writes the current containers.
         """
         live = list(live)
-        detail = self._outage({each.id: each.init_pid for each in live}) if self._path.exists() else ""
+        detail = self._outage({each.id: each.init_pid for each in live}, is_recorded) if self._path.exists() else ""
         self._told = True
         self.keep(live)
         return detail
 
-    def _outage(self, now: dict[str, int]) -> str:
+    def _outage(self, now: dict[str, int], is_recorded: Callable[[str], bool]) -> str:
         try:
             gone_s = max(time.time() - self._path.stat().st_mtime, 0)
             before = json.loads(read_bounded(str(self._path), FILE_BYTES))
@@ -74,7 +74,7 @@ class Presence:
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             log.warning("%s cannot be read: what ended without protection is not known (%s)", self._path, error)
             return "what was before is not known"
-        ended = [name or key[:12] for key, (name, pid) in rows.items() if key not in now]
+        ended = [name or key[:12] for key, (name, pid) in rows.items() if key not in now and not is_recorded(key)]
         again = [name or key[:12] for key, (name, pid) in rows.items() if key in now and now[key] != pid]
         parts = [f"{what}: {_few(names)}" for what, names in (("ended", ended), ("started again", again)) if names]
         line = f"the one before {how}, {gone_s:.0f} s without protection"

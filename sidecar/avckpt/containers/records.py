@@ -79,6 +79,10 @@ class Records:
                 if found is not None:
                     yield found
 
+    def has(self, container_id: str) -> bool:
+        """Whether there is a record of that container."""
+        return self._directory.joinpath(f"{container_id}.json").exists()
+
     def complain(self, container_id: str, line: str) -> None:
         """Logs what is wrong with a record ("": with all of them), unless it was logged at the last scan."""
         name = f"{container_id}.json"
