@@ -190,6 +190,13 @@ def test_a_plain_program_has_nobody_who_notifies_it(label: str) -> None:
     assert f"label {label.partition('=')[0]}: it takes containers and the sidecar, leave it out" in result.stderr
 
 
+@pytest.mark.parametrize("value", ["on", "mini"])
+def test_a_plain_program_has_nobody_who_writes_its_core(value: str) -> None:
+    result = avckpt("run", "-l", f"avckpt.core={value}", "--", "true")
+    assert result.exit_code == 2
+    assert "label avckpt.core: it takes the sidecar, which writes the files, leave it out" in result.stderr
+
+
 def test_a_plain_program_has_no_health_check() -> None:
     result = avckpt("run", "-l", "avckpt.restore.on=signal,unhealthy", "--", "true")
     assert result.exit_code == 2

@@ -73,6 +73,8 @@ def settings_of_run(labels: Mapping[str, str]) -> Settings:
         if key.startswith(("avckpt.group", "avckpt.notify")):
             raise LabelsWrong(f"label {key}: it takes containers and the sidecar, leave it out")
     settings = settings_of({"avckpt.enable": "true", **labels})
+    if settings.policy.core != "off":
+        raise LabelsWrong("label avckpt.core: it takes the sidecar, which writes the files, leave it out")
     if settings.policy.restore_on.unhealthy:
         raise LabelsWrong("label avckpt.restore.on: unhealthy takes a container's health check, leave it out")
     if labels.get("avckpt.enable", "true").strip().lower() in ("false", "0", "no", "off"):
