@@ -42,7 +42,8 @@ container.json    how it is now (avckpt ps --json)
 labels.json       its avckpt.* labels
 inspect.json      image, state, restarts and mounts, as Podman has them; no environment, no command
 container.log     the last {lines} lines that it wrote (with an event: of that time)
-journal.txt       the last {lines} lines of systemd's journal about it (with an event: of that time)
+journal.txt       the last {lines} lines of systemd's journal about it, where there is one (with an event: of
+                  that time)
 sidecar.json      the sidecar: version, configuration in force
 sidecar.log       the last {lines} lines of its log (with an event: of that time)
 metrics.txt       the sidecar's metrics
