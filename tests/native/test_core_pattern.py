@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from collections.abc import Iterator
@@ -78,3 +79,15 @@ def test_the_first_checkpoint_leaves_it_whole(tmp_path: Path, collector: Path) -
     with Victim("crash", tmp_path) as victim, GuardProcess(config(interval_s), [victim.pid]) as guard:
         guard.wait("attached")
         assert size_of_core(victim, collector, MISSED * interval_s) > PIPE_BYTES
+
+
+def test_a_child_writes_it_without_the_priority_of_its_guard(tmp_path: Path, collector: Path) -> None:
+    """Real-time tasks that copy gigabytes would leave no CPU to anybody else."""
+    with Victim("crash --in-child", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        assert guard.checkpoint()["kind"] == "checkpoint"
+        child = victim.player
+        os.kill(child, signal.SIGSEGV)
+        wait_until((collector / "begun").exists, PATIENCE_S, "the core is begun")
+        for _ in range(3):
+            assert guard.command("checkpoint")["kind"] == "missed"
+            assert os.sched_getscheduler(child) == os.SCHED_OTHER

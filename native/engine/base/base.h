@@ -231,6 +231,8 @@ int proc_same_file(pid_t a, pid_t b, const char *name);
 bool proc_is_exiting(pid_t tid);
 /* Whether it was killed by SIGKILL, even if it has not exited yet. */
 bool proc_is_killed(pid_t pid);
+/* The kernel writes its core. */
+bool proc_is_dumping(pid_t pid);
 /* Whether a signal is killing it, by an open /proc/PID/stat; the kernel may be writing its core. */
 bool proc_is_dying(int stat_fd);
 bool pidfd_ended(int pidfd);
@@ -492,6 +494,8 @@ void rt_priority_end(void);
 bool rt_priority_is(void);
 /* Gives another thread the calling one's priority; best effort. */
 void rt_priority_share(pid_t tid);
+/* Takes it back. */
+void rt_priority_unshare(pid_t tid);
 /* Gives it to a process that has an ordinary one, but not to its children; it has to end it itself
  * (rt_priority_begin_lent()), or rt_priority_reclaim().  False: it was not given. */
 bool rt_priority_lend(pid_t pid);

@@ -477,6 +477,13 @@ bool proc_is_dying(int stat_fd)
 	return proc_stat_of(stat_fd, &stat) == 0 && stat.flags & PF_SIGNALED;
 }
 
+bool proc_is_dumping(pid_t pid)
+{
+	char buf[4096];
+
+	return proc_read(pid, "status", buf, sizeof buf) > 0 && strstr(buf, "\nCoreDumping:\t1");
+}
+
 bool proc_is_killed(pid_t pid)
 {
 	static const char *const sets[] = { "\nSigPnd:", "\nShdPnd:" };

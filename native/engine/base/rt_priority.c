@@ -67,6 +67,14 @@ bool rt_priority_is(void)
 	return before.depth > 0;
 }
 
+void rt_priority_unshare(pid_t tid)
+{
+	const struct sched_param none = { 0 };
+
+	if (sched_getscheduler(tid) == SCHED_FIFO)
+		sched_setscheduler(tid, SCHED_OTHER, &none);
+}
+
 void rt_priority_share(pid_t tid)
 {
 	struct sched_param param;

@@ -51,7 +51,7 @@ static int await(const struct tree *tree, int (*wait)(struct process *, struct a
 
 /* A child that is killed ends within a moment, which is awaited before anything is stopped: where workers
  * are killed and replaced all the time, one of them is nearly always dying.  One whose core is being
- * written takes longer. */
+ * written takes longer, and must not write it with our priority: nobody else would get a CPU. */
 static int await_dying(const struct process *process, uint64_t end, struct avc_error *err)
 {
 	const uint64_t now = now_ns();
@@ -59,10 +59,11 @@ static int await_dying(const struct process *process, uint64_t end, struct avc_e
 
 	if (process_check_dying(process, &dies) == 0)
 		return 0;
-	if (process->descendant && now < end) {
+	if (process->descendant && now < end && !proc_is_dumping(process->pid)) {
 		process_hasten(process);
 		if (pidfd_await_end(process->pidfd, end - now))
 			return 0;
+		process_hasten_no_more(process);
 	}
 	*err = dies;
 	return -1;

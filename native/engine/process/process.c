@@ -109,15 +109,25 @@ void process_kill(const struct process *process)
 		0);
 }
 
-void process_hasten(const struct process *process)
+static void each_thread(const struct process *process, void (*fn)(pid_t tid))
 {
 	char name[16];
 
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		snprintf(name, sizeof name, "%d", process->threads[i].tid);
 		if (faccessat(process->task_dirfd, name, F_OK, 0) == 0)
-			rt_priority_share(process->threads[i].tid);
+			fn(process->threads[i].tid);
 	}
+}
+
+void process_hasten(const struct process *process)
+{
+	each_thread(process, rt_priority_share);
+}
+
+void process_hasten_no_more(const struct process *process)
+{
+	each_thread(process, rt_priority_unshare);
 }
 
 int process_open(struct process *process, pid_t pid, pid_t inside, struct avc_error *err)

@@ -76,6 +76,8 @@ int process_follow(struct process *process, struct avc_error *err) warn_unused;
 void process_kill(const struct process *process);
 /* After that: gives the threads whose end we wait for our priority. */
 void process_hasten(const struct process *process);
+/* One that has not ended in time has its own again. */
+void process_hasten_no_more(const struct process *process);
 /* Forgets the process (our view of the parasite stays mapped: templates use it). */
 void process_close(struct process *process);
 /* What can be read of a stopped thread from outside: mask, robust list, rseq, scheduling. */
