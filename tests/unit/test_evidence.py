@@ -155,6 +155,14 @@ def test_maps_and_notes_may_be_anything() -> None:
         assert build_id_of(wrong) == ""
 
 
+def test_a_path_adds_no_mapping() -> None:
+    text = b"1000-2000 r-xp 00000000 08:01 7 /a\r3000-4000 r-xp 00000000 08:01 8 /b\n5000-6000 rw-p 0 00:00 0\n"
+    assert [(each.start, each.path) for each in parse_maps(text)] == [
+        (0x1000, "/a\\r3000-4000 r-xp 00000000 08:01 8 /b"),
+        (0x5000, ""),
+    ]
+
+
 def test_a_machine_that_tells_nothing_costs_the_place_only() -> None:
     case = Collector(set).open_case(Event(Kind.DIED, 1, app_pid=1, wait_status=11), 1)
     assert case.crash == Crash(signal="SIGSEGV", unknown="the sidecar does not listen")

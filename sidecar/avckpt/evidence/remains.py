@@ -183,9 +183,9 @@ def read_maps(pid: int) -> list[Mapping]:
 
 
 def parse_maps(text: bytes) -> list[Mapping]:
-    """The text of /proc/PID/maps."""
+    """The text of /proc/PID/maps, in which only the newlines of a path are escaped."""
     mappings = []
-    for line in text.splitlines():
+    for line in text.split(b"\n"):
         found = _LINE.fullmatch(line)
         if found is not None:
             path = printable(found[7].decode("utf-8", "replace"))
