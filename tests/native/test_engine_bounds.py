@@ -6,13 +6,14 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from testkit.family import kill_main
 from testkit.guarded import GuardProcess, Victim, config
-from testkit.harness import SLOWNESS
+from testkit.harness import SLOWNESS, wait_until
 from testkit.procfs import peak_kb
 
 pytestmark = pytest.mark.shared_machine(
@@ -173,3 +174,54 @@ def test_what_it_has_open_is_bounded(tmp_path: Path) -> None:
         assert "more than 128 MB" in told["error"]["message"]
         assert peak_kb(guard_of(guard)) < 400 << 10
         crowd.wait_beats()
+
+
+DESCRIPTORS = {"ports": 4000}  # there are 28,000, for all
+MOST_DESCRIPTORS = 15_000
+URGENT_S = 1.0
+"""More CPU time than a restore may take with a real-time priority, which keeps others from the CPU."""
+
+
+def thread_s(pid: int) -> float:
+    """CPU time of the main thread."""
+    fields = Path(f"/proc/{pid}/task/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def urgent_s(pid: int, is_over: Callable[[], bool]) -> float:
+    """How much CPU time its main thread takes with a real-time priority until then."""
+    total, before = 0.0, thread_s(pid)
+    while not is_over():
+        now, is_urgent = thread_s(pid), os.sched_getscheduler(pid) == os.SCHED_FIFO
+        total, before = total + (now - before if is_urgent else 0), now
+        time.sleep(0.005)
+    return total
+
+
+@pytest.mark.parametrize(
+    ("kind", "how"),
+    [
+        ("streams", "dies"),
+        ("datagrams", "dies"),
+        ("ends", "closes"),
+        ("pipes", "closes again"),
+        ("listeners", "closes again"),
+        ("ports", "closes again"),
+    ],
+)
+def test_a_restore_of_many_descriptors_leaves_the_cpus_to_others(kind: str, how: str, tmp_path: Path) -> None:
+    """Each was compared with all others, for seconds, in which no other container got that CPU."""
+    _, _, again = how.partition(" ")
+    with (
+        Victim(f"horde {DESCRIPTORS.get(kind, MOST_DESCRIPTORS)} {kind} {again}", tmp_path) as horde,
+        GuardProcess(config(), [horde.pid]) as guard,
+    ):
+        assert guard.checkpoint()["kind"] == "checkpoint"
+        if how != "dies":
+            os.kill(horde.app, signal.SIGUSR1)
+            wait_until(lambda: horde.see().counter[0] > 0, PATIENCE_S, "they are closed")
+        since = guard.mark()
+        horde.kill_app()
+        assert urgent_s(guard.pid, lambda: guard.mark() > since + 1) < URGENT_S
+        guard.wait("restored", since=since)
+        horde.wait_beats()

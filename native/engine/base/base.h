@@ -490,8 +490,10 @@ void pageset_free(struct pageset *set);
 /* Between the two, the calling thread gets a CPU before others; best effort. May be nested. */
 void rt_priority_begin(void);
 void rt_priority_end(void);
-/* Whether it is between the two. */
+/* Whether it is between the two, and has not taken too much CPU time since. */
 bool rt_priority_is(void);
+/* To be called now and then (heartbeat() does): it gets an ordinary priority if it has. */
+void rt_priority_step(void);
 /* Gives another thread the calling one's priority; best effort. */
 void rt_priority_share(pid_t tid);
 /* Takes it back. */

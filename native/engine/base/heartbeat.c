@@ -27,6 +27,7 @@ int heartbeat_open(int fd)
 
 void heartbeat(void)
 {
+	rt_priority_step();
 	if (shared) /* a probe has none */
 		__atomic_fetch_add(&shared->beats, 1, __ATOMIC_RELAXED);
 }

@@ -5,17 +5,40 @@
  * becomes a real-time thread for those moments.
  *
  * Therefore, between rt_priority_begin() and rt_priority_end() the guard must not spin on another
- * task, which may need this very CPU.
+ * task, which may need this very CPU.  And the application, which may be hostile, decides how much there
+ * is to do: what takes too much CPU time is done with an ordinary priority, or a few containers could
+ * keep all others from every CPU.
  */
 #include <sched.h>
+#include <time.h>
 
 #include "base.h"
+
+#define MOST_NS (200 * NS_PER_MS) /* of CPU time */
 
 static __thread struct {
 	int depth, policy;
 	struct sched_param param;
 	bool changed;
+	bool spent;      /* it was too long                                             */
+	uint64_t end_ns; /* before that it cannot have been                         */
+	uint64_t ran_ns;
 } before;
+
+static uint64_t ran_ns(void)
+{
+	struct timespec ran = { 0 };
+
+	clock_gettime(CLOCK_THREAD_CPUTIME_ID, &ran);
+	return (uint64_t)ran.tv_sec * NS_PER_S + (uint64_t)ran.tv_nsec;
+}
+
+static void count_from_now(void)
+{
+	before.spent = false;
+	before.end_ns = now_ns() + MOST_NS;
+	before.ran_ns = ran_ns();
+}
 
 void rt_priority_begin(void)
 {
@@ -23,6 +46,7 @@ void rt_priority_begin(void)
 
 	if (before.depth++)
 		return;
+	count_from_now();
 	before.policy = sched_getscheduler(0);
 	/* Keeps a real-time policy that was set from outside. Without CAP_SYS_NICE, or in a cgroup
 	 * without real-time budget, the guard keeps its priority, and is slower. */
@@ -35,6 +59,25 @@ void rt_priority_end(void)
 {
 	if (--before.depth == 0 && before.changed)
 		sched_setscheduler(0, before.policy, &before.param);
+}
+
+void rt_priority_step(void)
+{
+	uint64_t now, ran;
+
+	if (!before.depth || !before.changed)
+		return;
+	now = now_ns();
+	if (now < before.end_ns)
+		return;
+	ran = ran_ns() - before.ran_ns;
+	if (ran < MOST_NS) {
+		before.end_ns = now + MOST_NS - ran;
+		return;
+	}
+	before.changed = false;
+	before.spent = true;
+	sched_setscheduler(0, before.policy, &before.param);
 }
 
 bool rt_priority_lend(pid_t pid)
@@ -59,12 +102,13 @@ void rt_priority_begin_lent(void)
 		before.policy = SCHED_OTHER;
 		before.param = (struct sched_param){ 0 };
 		before.changed = true;
+		count_from_now();
 	}
 }
 
 bool rt_priority_is(void)
 {
-	return before.depth > 0;
+	return before.depth > 0 && !before.spent;
 }
 
 void rt_priority_unshare(pid_t tid)

@@ -93,11 +93,23 @@ struct file *files_find(const struct files *files, int fd)
 	return files_find_among(files, files ? files->count : 0, fd);
 }
 
-/* The same file, socket, pipe...; of anonymous inodes only eventfds have an id. */
+/* Of anonymous inodes only eventfds have an id. */
+int files_compare(const struct file *a, const struct file *b)
+{
+	const uint64_t x[] = { a->kind, a->ino, a->dev,
+			       a->rdev, a->id,  (uint64_t)(a->flags & (O_ACCMODE | O_PATH)) };
+	const uint64_t y[] = { b->kind, b->ino, b->dev,
+			       b->rdev, b->id,  (uint64_t)(b->flags & (O_ACCMODE | O_PATH)) };
+
+	for (size_t i = 0; i < sizeof x / sizeof *x; i++)
+		if (x[i] != y[i])
+			return x[i] < y[i] ? -1 : 1;
+	return 0;
+}
+
 bool files_same_object(const struct file *a, const struct file *b)
 {
-	return a->kind == b->kind && a->dev == b->dev && a->ino == b->ino && a->rdev == b->rdev &&
-	       a->id == b->id && !((a->flags ^ b->flags) & (O_ACCMODE | O_PATH));
+	return !files_compare(a, b);
 }
 
 int files_find_device(const struct files *files, uint32_t rdev)

@@ -17,6 +17,7 @@
  *   files_options.c options of sockets, and whether one can be recreated
  *   files_unix.c    names of Unix sockets
  *   files_make.c    reopens and recreates what is lost
+ *   files_order.c   descriptors by object, sockets by name
  *   files_restore.c compares two tables and makes the one the other
  *   files_heirs.c   checks what a child shares with its parent
  *   files_family.c  all tables of an app: what its processes share
@@ -403,6 +404,36 @@ enum files_depth {
 struct files *files_new(uint32_t room);
 struct file *files_find(const struct files *files, int fd);
 bool files_same_object(const struct file *a, const struct file *b);
+/* Orders them by the object: file, socket, pipe, ...; 0: the same, opened for the same. */
+int files_compare(const struct file *a, const struct file *b);
+
+/* files_order.c */
+struct files_order {
+	const struct file **file;
+	uint32_t *next; /* of the first of an object: how many are not free any more */
+	uint32_t count;
+};
+
+bool files_order(struct files_order *order, const struct files *files);
+void files_order_free(struct files_order *order);
+/* One of the same object as `like` that is free, by number; it will not be asked for again. */
+const struct file *files_order_take(struct files_order *order, const struct file *like,
+				    bool (*is_free)(const struct file *file, const void *arg),
+				    const void *arg);
+/* Any end of that pipe. */
+const struct file *files_order_pipe(const struct files_order *order, uint64_t ino);
+
+struct socket_names {
+	const struct file_socket **socket;
+	uint32_t count, room;
+};
+
+bool socket_names_add(struct socket_names *names, const struct file_socket *socket);
+/* After the last, and before one is sought. */
+void socket_names_sort(struct socket_names *names);
+/* Whether one of them has the name that `socket` is connected to. */
+bool socket_names_have_peer(const struct socket_names *names, const struct file_socket *socket);
+void socket_names_free(struct socket_names *names);
 
 /* files_look.c */
 /* Whose they are. */
@@ -636,15 +667,16 @@ struct files_work {
 	pid_t table;
 	int table_pidfd;
 	struct files *want, *now;
-	int *local;              /* of want, by group leader: a descriptor of ours, or -1  */
-	int *claimed_by;         /* of now: leader (index in want) of the group that has it */
-	int *source;             /* of want, by group leader: index in now, or -1          */
-	bool *closed;            /* of now: by us                                          */
-	bool *lost;              /* of want: has to be restored */
-	bool *kept;              /* of want: inherited from the process that forks it */
-	struct files_work *host; /* of which process that is; NULL: none            */
-	uint32_t listed;         /* calls for the template, not made yet */
-	bool busy;               /* the task makes calls */
+	struct files_order order; /* of now                                              */
+	int *local;               /* of want, by group leader: a descriptor of ours, or -1  */
+	int *claimed_by;          /* of now: leader (index in want) of the group that has it */
+	int *source;              /* of want, by group leader: index in now, or -1          */
+	bool *closed;             /* of now: by us                                          */
+	bool *lost;               /* of want: has to be restored */
+	bool *kept;               /* of want: inherited from the process that forks it */
+	struct files_work *host;  /* of which process that is; NULL: none            */
+	uint32_t listed;          /* calls for the template, not made yet */
+	bool busy;                /* the task makes calls */
 	uint32_t problems;
 	struct avc_error *notes;
 };

@@ -622,6 +622,8 @@ static int await_gathered(struct tables *tables, struct avc_error *err)
 struct known_ends {
 	uint64_t *ino; /* of all sockets, sorted */
 	uint32_t count;
+	struct socket_names listening;
+	bool listed; /* those are                */
 };
 
 static int by_number(const void *a, const void *b)
@@ -648,19 +650,26 @@ static int list_sockets(struct known_ends *known, const struct image *image, uin
 	return 0;
 }
 
-/* Whether the server that it has connected to, but that has not accepted it, is the app's. */
-static bool listens_for(const struct image *image, uint32_t images, const struct file_socket *s)
+static void list_listening(struct known_ends *known, const struct image *image, uint32_t images)
 {
 	for (uint32_t i = 0; i < images; i++)
 		for (uint32_t k = 0; image[i].files && k < image[i].files->count; k++) {
-			const struct file_socket *l = image[i].files->file[k].socket;
+			const struct file_socket *s = image[i].files->file[k].socket;
 
-			if (l && l->domain == AF_UNIX && l->listening &&
-			    l->local_bytes == s->remote_bytes &&
-			    !memcmp(&l->local, &s->remote, s->remote_bytes))
-				return true;
+			if (s && s->domain == AF_UNIX && s->listening)
+				(void)socket_names_add(&known->listening, s);
 		}
-	return false;
+	socket_names_sort(&known->listening);
+	known->listed = true;
+}
+
+/* Whether the server that it has connected to, but that has not accepted it, is the app's. */
+static bool listens_for(const struct image *image, uint32_t images, const struct file_socket *s,
+			struct known_ends *known)
+{
+	if (!known->listed)
+		list_listening(known, image, images);
+	return socket_names_have_peer(&known->listening, s);
 }
 
 /* One that the app was started with cannot be made again by it, nor can a pair without names. */
@@ -676,7 +685,8 @@ static bool has_strange_end(const struct image *image, uint32_t images, const st
 			    struct known_ends *known)
 {
 	if (!s->peer)
-		return s->remote_bytes > sizeof(sa_family_t) && !listens_for(image, images, s);
+		return s->remote_bytes > sizeof(sa_family_t) &&
+		       !listens_for(image, images, s, known);
 	if (!known->ino && list_sockets(known, image, images))
 		return true;
 	return !bsearch(&s->peer, known->ino, known->count, sizeof *known->ino, by_number);
@@ -694,10 +704,12 @@ static void find_strange(const struct image *image, uint32_t images,
 		for (uint32_t k = 0; image[i].files && k < image[i].files->count; k++) {
 			struct file *f = &image[i].files->file[k];
 
+			(void)budget_step();
 			f->strange = cuts && may_be_strange(f) &&
 				     has_strange_end(image, images, f->socket, &known);
 		}
 	free(known.ino);
+	socket_names_free(&known.listening);
 }
 
 int files_restore(struct image *image, uint32_t images, const struct avc_config *config, pid_t init,

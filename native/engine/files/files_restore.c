@@ -228,23 +228,29 @@ static void give_up_own(struct files_work *work)
 	}
 }
 
+static bool is_unclaimed(const struct file *n, const void *arg)
+{
+	const struct files_work *work = arg;
+	const uint32_t k = files_index(work->now, n);
+
+	return work->claimed_by[k] < 0 && files_leader(work->now, n) == k;
+}
+
 /* Somewhere else in the table, perhaps: the app may have moved it. */
 static void find_moved(struct files_work *work)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {
-		const struct file *w = &work->want->file[i];
+		const struct file *w = &work->want->file[i], *n;
 
 		if (files_leader(work->want, w) != i || work->source[i] >= 0 ||
 		    (!(w->mode & S_IFMT) && !w->id))
 			continue;
 		(void)budget_step();
-		for (uint32_t k = 0; k < work->now->count && work->source[i] < 0; k++)
-			if (work->claimed_by[k] < 0 &&
-			    files_leader(work->now, &work->now->file[k]) == k &&
-			    files_same_object(w, &work->now->file[k])) {
-				work->claimed_by[k] = (int)i;
-				work->source[i] = (int)k;
-			}
+		n = files_order_take(&work->order, w, is_unclaimed, work);
+		if (n) {
+			work->source[i] = (int)files_index(work->now, n);
+			work->claimed_by[work->source[i]] = (int)i;
+		}
 	}
 }
 
@@ -267,10 +273,7 @@ static void make_pair(struct files_work *work, const struct file *w)
 
 static const struct file *pipe_in_table(const struct files_work *work, const struct file *w)
 {
-	for (uint32_t k = 0; w->kind == FILE_PIPE && k < work->now->count; k++)
-		if (work->now->file[k].kind == FILE_PIPE && work->now->file[k].ino == w->ino)
-			return &work->now->file[k];
-	return NULL;
+	return w->kind == FILE_PIPE ? files_order_pipe(&work->order, w->ino) : NULL;
 }
 
 /* An end of a pipe of which another end is still open, anywhere in the table. */
@@ -286,28 +289,49 @@ static int reopen_pipe(const struct files_work *work, const struct file *w)
 	return open(path, (w->flags & O_ACCMODE) | O_NONBLOCK | O_CLOEXEC);
 }
 
-/* Connections that a lost listening socket had accepted keep its port, and without
- * SO_REUSEADDR (socket(7)) to themselves. */
-static void share_port(const struct files_work *work, const struct file *w)
+/* The port is at the same place in an IPv6 address. */
+static uint32_t port_of(const struct sockaddr_storage *address)
 {
-	const struct sockaddr_in *wanted;
+	return ntohs(((const struct sockaddr_in *)address)->sin_port) |
+	       (address->ss_family == AF_INET6 ? UINT32_C(1) << 16 : 0);
+}
+
+static bool is_listening(const struct file *w)
+{
+	return w->socket && w->socket->listening &&
+	       (w->socket->domain == AF_INET || w->socket->domain == AF_INET6);
+}
+
+static bool is_lost_listener(const struct files_work *work, uint32_t i)
+{
+	const struct file *w = &work->want->file[i];
+
+	return work->lost[i] && !work->kept[i] && is_listening(w) &&
+	       work->local[files_leader(work->want, w)] < 0;
+}
+
+/* Connections that lost listening sockets had accepted keep their ports, and without SO_REUSEADDR
+ * (socket(7)) to themselves. */
+static void share_ports(const struct files_work *work)
+{
+	bool wanted[2 << 16] = { false };
 	const int yes = 1;
 
-	if (!w->socket || !w->socket->listening || w->socket->domain == AF_UNIX)
-		return;
-	wanted = (const struct sockaddr_in *)&w->socket->local;
+	for (uint32_t i = 0; i < work->want->count; i++)
+		if (is_lost_listener(work, i))
+			wanted[port_of(&work->want->file[i].socket->local)] = true;
 	for (uint32_t k = 0; k < work->now->count; k++) {
 		struct sockaddr_storage address = { 0 };
-		const struct sockaddr_in *is = (const struct sockaddr_in *)&address;
 		socklen_t bytes = sizeof address;
 		int fd;
 
 		if (work->now->file[k].kind != FILE_SOCKET)
 			continue;
-		/* The port is at the same place in an IPv6 address. */
+		(void)budget_step();
 		fd = proc_borrow_fd(work->table_pidfd, work->now->file[k].fd);
 		if (fd >= 0 && getsockname(fd, (struct sockaddr *)&address, &bytes) == 0 &&
-		    is->sin_family == wanted->sin_family && is->sin_port == wanted->sin_port)
+		    (address.ss_family == AF_INET || address.ss_family == AF_INET6) &&
+		    wanted[port_of(&address)])
 			setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);
 		close_fd(&fd);
 	}
@@ -317,28 +341,34 @@ static void share_port(const struct files_work *work, const struct file *w)
  * description that has to be restored. */
 static void gather(struct files_work *work)
 {
+	bool any = false;
+
 	for (uint32_t i = 0; i < work->want->count; i++) {
 		const struct file *w = &work->want->file[i];
 		const uint32_t group = files_leader(work->want, w);
 
 		if (!work->lost[i] || work->kept[i] || work->local[group] >= 0)
 			continue;
+		(void)budget_step();
 		if (work->source[group] >= 0)
 			work->local[group] = proc_borrow_fd(
 				work->table_pidfd, work->now->file[work->source[group]].fd);
 		if (work->local[group] < 0)
 			work->local[group] = reopen_pipe(work, w);
-		if (work->local[group] < 0)
-			share_port(work, w);
+		any |= is_lost_listener(work, i);
 	}
+	if (any)
+		share_ports(work);
 }
 
 /* The rest, after what the app has opened since is closed, and its ports are free. */
 static void make_lost(struct files_work *work)
 {
-	for (uint32_t i = 0; i < work->want->count; i++)
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		(void)budget_step();
 		if (work->lost[i] && !pipe_in_table(work, &work->want->file[i]))
 			make_pair(work, &work->want->file[i]);
+	}
 	for (uint32_t i = 0; i < work->want->count; i++) {
 		const struct file *w = &work->want->file[i];
 		const uint32_t group = files_leader(work->want, w);
@@ -611,6 +641,7 @@ static int receive(struct files_work *work, struct numbers *numbers, int ours, i
 
 		if (!work->lost[i] || from < 0)
 			continue;
+		(void)budget_step();
 		to = lowest_free(numbers, NULL);
 		/* Descriptors not yet received wait in the socket, which holds some hundred. */
 		if (fd_send(ours, from) &&
@@ -869,7 +900,7 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 		files_find_going(work->now);
 	}
 	work->closed = calloc(work->now->count + 1, sizeof *work->closed);
-	if (!work->closed)
+	if (!work->closed || !files_order(&work->order, work->now))
 		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
 	find_moved(work);
 	give_up_useless(work);
@@ -896,6 +927,7 @@ void files_work_end(struct files_work *work)
 	free(work->kept);
 	free(work->claimed_by);
 	free(work->closed);
+	files_order_free(&work->order);
 	files_free(work->now);
 }
 

@@ -370,12 +370,20 @@ void files_find_peers(struct files *files, pid_t pid)
 
 /* ---- bytes in pipes and socket pairs ------------------------------------------ */
 
+static bool reads(const struct file *f)
+{
+	return f->kind == FILE_PIPE && (f->flags & O_ACCMODE) == O_RDONLY;
+}
+
+/* Of a pipe those to write to come first: a process may have thousands of each. */
 static int by_end(const void *a, const void *b)
 {
 	const struct file *x = *(const struct file *const *)a, *y = *(const struct file *const *)b;
 
 	if (x->ino != y->ino)
 		return x->ino < y->ino ? -1 : 1;
+	if (reads(x) != reads(y))
+		return reads(x) ? 1 : -1;
 	return (x->fd > y->fd) - (x->fd < y->fd);
 }
 
@@ -393,26 +401,19 @@ static bool sort_ends(struct files *files)
 	return files->ends;
 }
 
-static bool is_other_end(const struct file *file, const struct file *f)
-{
-	return file->kind == f->kind &&
-	       (file->kind == FILE_SOCKET ||
-		((f->flags & O_ACCMODE) != O_RDONLY && (file->flags & O_ACCMODE) == O_RDONLY));
-}
-
 const struct file *files_other_end(struct files *files, const struct file *file)
 {
 	const uint64_t ino = file->kind == FILE_SOCKET ? file->socket ? file->socket->peer : 0
 						       : file->ino;
 	uint32_t at;
 
-	if (!ino || !sort_ends(files))
+	if (!ino || (file->kind == FILE_PIPE && !reads(file)) || !sort_ends(files))
 		return NULL;
 	at = LOWER_BOUND(files->end_count, i, files->ends[i]->ino < ino);
-	for (; at < files->end_count && files->ends[at]->ino == ino; at++)
-		if (is_other_end(file, files->ends[at]))
-			return files->ends[at];
-	return NULL;
+	return at < files->end_count && files->ends[at]->ino == ino &&
+			       files->ends[at]->kind == file->kind && !reads(files->ends[at])
+		       ? files->ends[at]
+		       : NULL;
 }
 
 static bool scratch_open(struct scratch *scratch, int bytes)

@@ -384,34 +384,38 @@ static const char *connect_unix(const struct files_work *work, int fd, const str
 		       : NULL;
 }
 
-/* Whether it is connected to the name of a recreated socket. */
-static bool is_peer_new(const struct files_work *work, const struct file_socket *s)
+/* The names of recreated sockets. */
+static void list_new(const struct files_work *work, struct socket_names *names)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {
-		const struct file_socket *peer = work->want->file[i].socket;
+		const struct file_socket *s = work->want->file[i].socket;
 
-		if (peer && !files_now_of(work, i) && peer->domain == AF_UNIX &&
-		    peer->local_bytes == s->remote_bytes &&
-		    !memcmp(&peer->local, &s->remote, s->remote_bytes))
-			return true;
+		if (s && s->domain == AF_UNIX && is_named(s->local_bytes) &&
+		    !files_now_of(work, i))
+			(void)socket_names_add(names, s);
 	}
-	return false;
+	socket_names_sort(names);
 }
 
 /* When all have their names: connects Unix datagram sockets that were recreated, or were connected
  * to one. */
 void files_connect_again(struct files_work *work)
 {
+	struct socket_names new_names = { 0 };
+
+	list_new(work, &new_names);
 	for (uint32_t i = 0; i < work->want->count; i++) {
 		const struct file *w = &work->want->file[i];
 		int fd;
 
 		if (files_leader(work->want, w) != i || work->kept[i] || !is_connected(w->socket) ||
-		    (files_now_of(work, i) && !is_peer_new(work, w->socket)))
+		    (files_now_of(work, i) && !socket_names_have_peer(&new_names, w->socket)))
 			continue;
+		(void)budget_step();
 		fd = files_borrow_placed(work, w);
 		if (fd >= 0)
 			files_note(work, w, connect_unix(work, fd, w->socket));
 		close_fd(&fd);
 	}
+	socket_names_free(&new_names);
 }
