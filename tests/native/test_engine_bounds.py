@@ -207,6 +207,7 @@ def urgent_s(pid: int, is_over: Callable[[], bool]) -> float:
         ("pipes", "closes again"),
         ("listeners", "closes again"),
         ("ports", "closes again"),
+        ("locks", "dies"),
     ],
 )
 def test_a_restore_of_many_descriptors_leaves_the_cpus_to_others(kind: str, how: str, tmp_path: Path) -> None:
@@ -224,4 +225,16 @@ def test_a_restore_of_many_descriptors_leaves_the_cpus_to_others(kind: str, how:
         horde.kill_app()
         assert urgent_s(guard.pid, lambda: guard.mark() > since + 1) < URGENT_S
         guard.wait("restored", since=since)
+        horde.wait_beats()
+
+
+def test_watches_that_cannot_be_told_apart_do_not_occupy_the_guard(tmp_path: Path) -> None:
+    """To find what each of 15,000 watches of one number is of would take hours."""
+    with (
+        Victim(f"horde {MOST_DESCRIPTORS} watches", tmp_path) as horde,
+        GuardProcess(config(), [horde.pid]) as guard,
+    ):
+        told = guard.command("checkpoint", timeout_s=PATIENCE_S)
+        assert told["kind"] == "missed", told
+        assert "takes longer" in told["error"]["message"]
         horde.wait_beats()

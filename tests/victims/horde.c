@@ -2,12 +2,14 @@
  *
  * horde N KIND [again]: has so many descriptors from the start: dups of one file; pipes; ends of one pipe;
  * eventfds; streams (connected to sockets of its own that accept nothing); datagrams (connected to one
- * of its own); listeners; ports (TCP).  SIGUSR1 closes them all, opens as many others where it is to do it
+ * of its own); listeners; ports (TCP); locks
+ * of one file; watches of one epoll set, all by the same number.  SIGUSR1 closes them all, opens as many others where it is to do it
  * again, and counts that in counter[0].  Beats every 1 ms.
  */
 #include <netinet/in.h>
 #include <signal.h>
 #include <stddef.h>
+#include <sys/epoll.h>
 #include <sys/eventfd.h>
 #include <sys/random.h>
 #include <sys/resource.h>
@@ -64,6 +66,25 @@ static void move_up(int fd, int least)
 	must(fcntl(fd, F_DUPFD, least) >= least && !close(fd), "dup");
 }
 
+static void lock(int fd, int at)
+{
+	struct flock one = { .l_type = F_WRLCK, .l_start = at, .l_len = 1 };
+
+	must(!fcntl(fd, F_OFD_SETLK, &one), "F_OFD_SETLK");
+}
+
+/* Each by the same number. */
+static void watch(int *set, int number)
+{
+	struct epoll_event event = { .events = EPOLLIN };
+	const int fd = eventfd(0, 0);
+
+	if (*set < 0)
+		*set = epoll_create1(0);
+	must(fd >= 0 && dup2(fd, number) == number, "dup2");
+	must(!epoll_ctl(*set, EPOLL_CTL_ADD, number, &event), "epoll_ctl");
+}
+
 static void port(void)
 {
 	const int fd = socket(AF_INET, SOCK_STREAM, 0);
@@ -81,7 +102,7 @@ static int reopen(int fd, int flags)
 
 static void open_all(int n, const char *kind)
 {
-	int ends[2], first = fcntl(0, F_DUPFD, FIRST);
+	int ends[2], set = -1, first = fcntl(memfd_create("horde", 0), F_DUPFD, FIRST);
 
 	for (int i = 0; i < n; i++)
 		if (!strcmp(kind, "dups"))
@@ -92,6 +113,10 @@ static void open_all(int n, const char *kind)
 			must(!pipe(ends), "pipe");
 		else if (!strcmp(kind, "ends"))
 			must(reopen(ends[0], i < n / 2 ? O_RDONLY : O_WRONLY) >= 0, "open");
+		else if (!strcmp(kind, "locks"))
+			lock(first, 2 * i);
+		else if (!strcmp(kind, "watches"))
+			watch(&set, first);
 		else if (!strcmp(kind, "ports"))
 			port();
 		else if (!strcmp(kind, "eventfds"))

@@ -90,6 +90,7 @@ static void list_lock(struct setup *setup, const struct file *w, const struct fi
 
 static bool has_lock(const struct file *f, const struct file_lock *lock)
 {
+	(void)budget_step();
 	for (uint32_t i = 0; i < f->lock_count; i++)
 		if (!memcmp(&f->lock[i], lock, sizeof *lock))
 			return true;

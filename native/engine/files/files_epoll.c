@@ -80,8 +80,9 @@ void files_find_closed(struct files *files, pid_t pid)
 
 		if (set->kind != FILE_EPOLL || set->shared != set->fd)
 			continue;
+		/* To find one that has the number of others takes the kernel as long as there are. */
 		for (uint32_t k = 0; k < set->watch_count; k++)
-			if (is_odd(files, set, k))
+			if (is_odd(files, set, k) && budget_step())
 				set->watch[k].of = find_target(files, pid, set, &set->watch[k]);
 	}
 }

@@ -502,6 +502,7 @@ static bool is_watched_since(const struct files_work *work, const struct file *w
 {
 	const struct file *w = files_find(work->want, watch->fd);
 
+	(void)budget_step();
 	return !files_find_watch(want, watch) || !w || work->lost[files_index(work->want, w)];
 }
 

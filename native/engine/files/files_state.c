@@ -719,6 +719,7 @@ static const char *put_ofd_locks(int fd, const struct file *want, const struct f
 
 	for (uint32_t i = 0; now && i < now->lock_count; i++)
 		if (now->lock[i].kind == LOCK_OFD_) {
+			(void)budget_step();
 			lock.l_type = F_UNLCK;
 			lock.l_start = now->lock[i].start;
 			lock.l_len = now->lock[i].end < 0
@@ -728,6 +729,7 @@ static const char *put_ofd_locks(int fd, const struct file *want, const struct f
 		}
 	for (uint32_t i = 0; i < want->lock_count; i++)
 		if (want->lock[i].kind == LOCK_OFD_) {
+			(void)budget_step();
 			lock.l_type = want->lock[i].exclusive ? F_WRLCK : F_RDLCK;
 			lock.l_start = want->lock[i].start;
 			lock.l_len = want->lock[i].end < 0
@@ -746,6 +748,7 @@ static bool same_ofd_locks(const struct file *a, const struct file *b)
 	for (uint32_t i = 0; i < a->lock_count; i++) {
 		bool found = a->lock[i].kind != LOCK_OFD_;
 
+		(void)budget_step();
 		for (uint32_t k = 0; !found && k < b->lock_count; k++)
 			found = !memcmp(&a->lock[i], &b->lock[k], sizeof *a->lock);
 		if (!found)

@@ -497,11 +497,13 @@ static int finish(struct avc_guard *guard, struct generation *fresh, struct avc_
 	return result;
 }
 
-static void settle_files(struct avc_guard *guard, struct generation *fresh)
+/* The app runs again, and decides how long this takes. */
+static int settle_files(struct avc_guard *guard, struct generation *fresh, struct avc_error *err)
 {
 	const struct generation *before = guard->count ? &guard->generations[guard->count - 1]
 						       : NULL;
 
+	budget_deadline(READ_NS);
 	for (uint32_t i = 0; i < fresh->images; i++)
 		if (fresh->image[i].process)
 			files_settle(&fresh->image[i]);
@@ -509,6 +511,8 @@ static void settle_files(struct avc_guard *guard, struct generation *fresh)
 		files_settle_family(fresh->image, fresh->images, before ? before->image : NULL,
 				    before ? before->images : 0);
 	files_find_own(fresh->image, fresh->images);
+	budget_deadline(0);
+	return budget_check(guard->main.pid, err);
 }
 
 static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_event *event,
@@ -533,14 +537,13 @@ static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_ev
 	event->clone_ns = freeze->clone_ns;
 	event->wait_ns = freeze->wait_ns;
 	event->threads = generation_threads(fresh);
-	if (result || finish(guard, fresh, err) ||
+	if (result || finish(guard, fresh, err) || settle_files(guard, fresh, err) ||
 	    (guard->meeting && guard_meet_taken(guard, err))) {
 		abandon(guard, fresh);
 		return -1;
 	}
 	event->at_ns = fresh->taken_ns;
 	event->error = *generation_notice(fresh);
-	settle_files(guard, fresh);
 	fresh->number = ++guard->number;
 	if (!guard->main.recycling)
 		guard->dirty.fork_ns = freeze->clone_ns;
