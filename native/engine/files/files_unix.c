@@ -390,8 +390,7 @@ static void list_new(const struct files_work *work, struct socket_names *names)
 	for (uint32_t i = 0; i < work->want->count; i++) {
 		const struct file_socket *s = work->want->file[i].socket;
 
-		if (s && s->domain == AF_UNIX && is_named(s->local_bytes) &&
-		    !files_now_of(work, i))
+		if (s && s->domain == AF_UNIX && is_named(s->local_bytes) && !files_now_of(work, i))
 			(void)socket_names_add(names, s);
 	}
 	socket_names_sort(names);
