@@ -56,6 +56,18 @@ def wait_spare(victim: Victim, other_than: int = 0) -> int:
     return found[0]
 
 
+def wait_template(victim: Victim) -> int:
+    """The only one; a spare that was forked a moment ago still has its name."""
+    found: list[int] = []
+
+    def is_alone() -> bool:
+        found[:] = ours(victim, "avckpt-tmpl")
+        return len(found) == 1
+
+    wait_until(is_alone, PATIENCE_S, "one template")
+    return found[0]
+
+
 def open_spare(victim: Victim) -> int:
     """A pidfd of the spare."""
     while True:
@@ -399,7 +411,7 @@ def test_its_template_is_killed_in_the_making(slow: Callable[[], Cgroup], tmp_pa
     with inside(cgroup, "idle 200 2", tmp_path) as (victim, guard):
         for _ in range(6):
             guard.checkpoint()
-            (template,) = ours(victim, "avckpt-tmpl")
+            template = wait_template(victim)
             time.sleep(rng.uniform(0.015, 0.03))
             cgroup.wait()
             time.sleep(rng.choice([0.6, 1.0]))
