@@ -125,6 +125,17 @@ def final_death_s(folder: Path, *, seen: bool) -> float:
         return waited
 
 
+def test_init_has_no_priority_of_a_dead_guard(tmp_path: Path) -> None:
+    """A guard lends init its own for a moment, and may be killed just then."""
+    lent = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+    with Victim("idle 1 1", tmp_path) as victim:
+        os.sched_setscheduler(victim.pid, lent, os.sched_param(1))
+        assert os.sched_getscheduler(victim.pid) == lent
+        with GuardProcess(config(), [victim.pid]) as guard:
+            guard.wait("attached")
+            assert os.sched_getscheduler(victim.pid) == os.SCHED_OTHER
+
+
 @SHARED
 def test_a_final_death_waits_until_it_has_been_looked_at(tmp_path: Path) -> None:
     assert final_death_s(tmp_path, seen=False) >= SEEN_S

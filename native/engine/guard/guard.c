@@ -334,6 +334,8 @@ static void attach(struct avc_guard *guard)
 
 	switch (init_channel_open(&guard->channel, &error)) {
 	case 1:
+		/* From a guard that was killed while it waited for init (guard_wait_ended()). */
+		rt_priority_reclaim(guard->channel.init);
 		if (guard_find_app(guard, &error)) {
 			init_channel_close(&guard->channel);
 			break;
