@@ -29,7 +29,9 @@
 #include "avckpt/guard.h"
 #include "files.h"
 
-#define COMES_NS (2 * NS_PER_MS)  /* of all, while everything is stopped                */
+#define COMES_NS (2 * NS_PER_MS) /* of all, while everything is stopped                */
+/* A process of the app's that reads slowly takes no more: its window is full, in every freeze. */
+#define STEP_NS (NS_PER_MS / 4)
 #define MEND_NS (500 * NS_PER_MS) /* of all, when everything is dead                     */
 #define LOOK_US 20
 #define COUNT_TRIES 16
@@ -429,16 +431,25 @@ static void acknowledge(int fd)
 	setsockopt(fd, IPPROTO_TCP, TCP_QUICKACK, &yes, sizeof yes);
 }
 
-/* Whether everything written has arrived; waits for it until `until`. */
+/* How long to wait for what has not arrived: in all, and for more of it. */
+struct patience {
+	uint64_t until, step_ns;
+};
+
+/* Whether everything written has arrived. */
 static bool has_come(const struct group_end *end, uint64_t written, uint64_t *unread,
-		     uint64_t until)
+		     const struct patience *patience)
 {
-	uint64_t ignored, received;
+	uint64_t ignored, received, before = UINT64_MAX, came_ns = 0, now;
 
 	while (!count_tcp(end->fd, &ignored, &received, unread)) {
 		if (received == written)
 			return true;
-		if (now_ns() > until)
+		now = now_ns();
+		if (received != before)
+			came_ns = now;
+		before = received;
+		if (now > patience->until || now - came_ns > patience->step_ns)
 			break;
 		acknowledge(end->fd);
 		usleep(LOOK_US);
@@ -467,9 +478,9 @@ static bool keep_bytes(struct group_end *end, uint64_t bytes)
 	return n == (ssize_t)bytes && !(head.msg_flags & (MSG_CTRUNC | MSG_TRUNC));
 }
 
-void files_ends_keep(struct group_ends *ends, struct avc_board *board)
+static void keep(struct group_ends *ends, struct avc_board *board, uint64_t step_ns)
 {
-	const uint64_t until = now_ns() + COMES_NS;
+	const struct patience patience = { now_ns() + COMES_NS, step_ns };
 	const struct named_ends named = sort_board(board);
 
 	for (uint32_t i = 0; ends && i < ends->count; i++) {
@@ -484,7 +495,7 @@ void files_ends_keep(struct group_ends *ends, struct avc_board *board)
 		end->why = other ? "what was in flight cannot be kept"
 				 : "its other end is not a connection of the group's";
 		if (other && is_tcp(end)) {
-			const bool come = has_come(end, other->written, &unread, until);
+			const bool come = has_come(end, other->written, &unread, &patience);
 
 			end->kept = come && keep_bytes(end, unread);
 			if (!come)
@@ -499,6 +510,11 @@ void files_ends_keep(struct group_ends *ends, struct avc_board *board)
 		drop_end(end);
 	}
 	free(named.end);
+}
+
+void files_ends_keep(struct group_ends *ends, struct avc_board *board)
+{
+	keep(ends, board, COMES_NS);
 }
 
 static void add_own(struct group_ends *ends, const struct image *image, const struct pairs *pairs,
@@ -524,7 +540,7 @@ struct group_ends *files_ends_keep_own(const struct image *image, uint32_t image
 	if (ends && board) {
 		for (uint32_t i = 0; i < images; i++)
 			add_own(ends, &image[i], &pairs, board);
-		files_ends_keep(ends, board);
+		keep(ends, board, STEP_NS);
 	}
 	free(board);
 	return ends;
