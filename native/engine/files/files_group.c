@@ -431,22 +431,23 @@ static void acknowledge(int fd)
 	setsockopt(fd, IPPROTO_TCP, TCP_QUICKACK, &yes, sizeof yes);
 }
 
-/* How long to wait for what has not arrived: in all, and for more of it. */
+/* How long to wait for what has not arrived: in all, and for more of it.  While one connection is
+ * waited for, others arrive. */
 struct patience {
-	uint64_t until, step_ns;
+	uint64_t began, until, step_ns;
 };
 
 /* Whether everything written has arrived. */
 static bool has_come(const struct group_end *end, uint64_t written, uint64_t *unread,
 		     const struct patience *patience)
 {
-	uint64_t ignored, received, before = UINT64_MAX, came_ns = 0, now;
+	uint64_t ignored, received, before = UINT64_MAX, came_ns = patience->began, now;
 
 	while (!count_tcp(end->fd, &ignored, &received, unread)) {
 		if (received == written)
 			return true;
 		now = now_ns();
-		if (received != before)
+		if (before != UINT64_MAX && received != before)
 			came_ns = now;
 		before = received;
 		if (now > patience->until || now - came_ns > patience->step_ns)
@@ -480,7 +481,8 @@ static bool keep_bytes(struct group_end *end, uint64_t bytes)
 
 static void keep(struct group_ends *ends, struct avc_board *board, uint64_t step_ns)
 {
-	const struct patience patience = { now_ns() + COMES_NS, step_ns };
+	const uint64_t began = now_ns();
+	const struct patience patience = { began, began + COMES_NS, step_ns };
 	const struct named_ends named = sort_board(board);
 
 	for (uint32_t i = 0; ends && i < ends->count; i++) {
