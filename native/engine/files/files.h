@@ -16,6 +16,7 @@
  *   files_messages.c contents of Unix sockets, and which ends are shut down
  *   files_options.c options of sockets, and whether one can be recreated
  *   files_unix.c    names of Unix sockets
+ *   files_strange.c Unix connections to processes outside
  *   files_make.c    reopens and recreates what is lost
  *   files_order.c   descriptors by object, sockets by name
  *   files_restore.c compares two tables and makes the one the other
@@ -563,6 +564,10 @@ bool file_is_connecting(int fd, const struct file_socket *socket);
 bool file_socket_has_name(int fd, const struct file_socket *socket);
 /* Sets those that differ.  Returns NULL or what failed. */
 const char *file_put_options(int fd, const struct file_socket *socket);
+
+/* files_strange.c: sets `strange` of all, as the configuration says. */
+void files_find_strange(const struct image *image, uint32_t images,
+			const struct avc_config *config);
 
 /* files_unix.c */
 bool file_unix_is_alone(const struct file_socket *socket);

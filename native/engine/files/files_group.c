@@ -10,7 +10,8 @@
  * which data moved, TCP is reset at both ends, before the restore reads their state: after the
  * other end's reset there may still be unread data.
  *
- * Guards match the ends of a connection on a board that they share (avckpt/guard.h).
+ * Guards match the ends of a connection on a board that they share (avckpt/guard.h).  An app without
+ * a group has one of its own, for TCP connections between its own processes.
  */
 #include <arpa/inet.h>
 #include <fcntl.h>
