@@ -29,26 +29,35 @@ def built(init_built: None, victims_built: Path) -> None:
     """avckpt-init and the victims."""
 
 
+def kill_some_times(guard: GuardProcess, until: Callable[[], Callable[[], bool]]) -> None:
+    rng = random.Random(1)
+    app = guard.wait("attached")["app_pid"]
+    for _ in range(KILLS):
+        checkpoint(guard)
+        time.sleep(rng.uniform(0, 0.05))
+        since = guard.mark()
+        os.kill(app, signal.SIGKILL)
+        app = guard.wait("restored", since=since)["app_pid"]
+        wait_until(until(), PATIENCE_S, "every client has answers")
+
+
+def all_have_answers(victim: Victim) -> Callable[[], bool]:
+    """Whether each of its clients has some more than now."""
+    before = victim.see().counter
+
+    def check() -> bool:
+        seen = victim.see()
+        assert not seen.violations, victim.said
+        return all(seen.counter[i] > before[i] + 20 for i in range(CLIENTS))
+
+    return check
+
+
 @pytest.mark.parametrize("command", ["stream", "record", "stream --again", "record --again", "tcp", "tcp6"])
 def test_every_question_has_its_answer(command: str, tmp_path: Path) -> None:
     """The server is killed at random moments; its clients, which go back with it, wait for no lost answer."""
-    rng = random.Random(1)
     with Victim(f"callers {CLIENTS} {command}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
-        app = guard.wait("attached")["app_pid"]
-        for _ in range(KILLS):
-            checkpoint(guard)
-            time.sleep(rng.uniform(0, 0.05))
-            since = guard.mark()
-            os.kill(app, signal.SIGKILL)
-            app = guard.wait("restored", since=since)["app_pid"]
-            before = victim.see().counter
-
-            def all_go_on(before: tuple[int, ...] = before) -> bool:
-                seen = victim.see()
-                assert not seen.violations, victim.said
-                return all(seen.counter[i] > before[i] + 20 for i in range(CLIENTS))
-
-            wait_until(all_go_on, PATIENCE_S, "every client has answers")
+        kill_some_times(guard, lambda: all_have_answers(victim))
 
 
 TYPES = {"stream": socket.SOCK_STREAM, "record": socket.SOCK_SEQPACKET}
@@ -110,18 +119,6 @@ class Asker(threading.Thread):
             self.ended += 1
 
 
-def kill_some_times(guard: GuardProcess, until: Callable[[], Callable[[], bool]]) -> None:
-    rng = random.Random(1)
-    app = guard.wait("attached")["app_pid"]
-    for _ in range(KILLS):
-        checkpoint(guard)
-        time.sleep(rng.uniform(0, 0.05))
-        since = guard.mark()
-        os.kill(app, signal.SIGKILL)
-        app = guard.wait("restored", since=since)["app_pid"]
-        wait_until(until(), PATIENCE_S, "every client has answers")
-
-
 @pytest.mark.parametrize("where", ["", "--in-child"])
 @pytest.mark.parametrize("kind", TYPES)
 def test_a_server_outside_answers_what_was_asked(kind: str, where: str, tmp_path: Path) -> None:
@@ -132,18 +129,7 @@ def test_a_server_outside_answers_what_was_asked(kind: str, where: str, tmp_path
         Victim(f"callers {CLIENTS} {kind} {path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
     ):
-
-        def all_go_on() -> Callable[[], bool]:
-            before = victim.see().counter
-
-            def check() -> bool:
-                seen = victim.see()
-                assert not seen.violations, victim.said
-                return all(seen.counter[i] > before[i] + 20 for i in range(CLIENTS))
-
-            return check
-
-        kill_some_times(guard, all_go_on)
+        kill_some_times(guard, lambda: all_have_answers(victim))
 
 
 @pytest.mark.parametrize("kind", TYPES)

@@ -533,6 +533,8 @@ ssize_t file_send_as_nobody(int fd, const void *data, size_t bytes, const int *p
 /* `passed`: descriptors of ours for want->flight, -1: lost; NULL: all are. */
 const char *file_put_content(int fd, int other_fd, const struct file *want, const int *passed);
 bool file_tcp_moved(const struct file *want, const struct file *now);
+/* 0: no internet address, or it has none. */
+uint32_t address_port(const struct sockaddr_storage *address);
 /* Which ones belong to a server: a port on which the app listens. */
 void files_find_accepted(struct files *files);
 /* Whether it is a client's, and its peer may have had more to say: the end of file would make what was

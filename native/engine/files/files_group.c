@@ -305,17 +305,6 @@ struct pairs {
 	uint64_t bit[PAIR_BITS / 64];
 };
 
-static bool port_of(const struct sockaddr_storage *address, uint32_t *port)
-{
-	if (address->ss_family == AF_INET)
-		*port = ntohs(((const struct sockaddr_in *)address)->sin_port);
-	else if (address->ss_family == AF_INET6)
-		*port = ntohs(((const struct sockaddr_in6 *)address)->sin6_port);
-	else
-		return false;
-	return true;
-}
-
 static uint32_t pair_bit(uint32_t from, uint32_t to)
 {
 	return (from * 40503 + to) % PAIR_BITS;
@@ -323,8 +312,11 @@ static uint32_t pair_bit(uint32_t from, uint32_t to)
 
 static bool is_own(const struct file *f, uint32_t *own, uint32_t *other)
 {
-	return may_go_on(f) && f->socket->domain != AF_UNIX && port_of(&f->socket->local, own) &&
-	       port_of(&f->socket->remote, other);
+	if (!may_go_on(f))
+		return false;
+	*own = address_port(&f->socket->local);
+	*other = address_port(&f->socket->remote);
+	return *own && *other;
 }
 
 /* A server may have thousands of connections, and the application is stopped: so this compares no

@@ -289,11 +289,10 @@ static int reopen_pipe(const struct files_work *work, const struct file *w)
 	return open(path, (w->flags & O_ACCMODE) | O_NONBLOCK | O_CLOEXEC);
 }
 
-/* The port is at the same place in an IPv6 address. */
-static uint32_t port_of(const struct sockaddr_storage *address)
+/* IPv6 has ports of its own. */
+static uint32_t port_number(const struct sockaddr_storage *address)
 {
-	return ntohs(((const struct sockaddr_in *)address)->sin_port) |
-	       (address->ss_family == AF_INET6 ? UINT32_C(1) << 16 : 0);
+	return address_port(address) | (address->ss_family == AF_INET6 ? UINT32_C(1) << 16 : 0);
 }
 
 static bool is_listening(const struct file *w)
@@ -319,7 +318,7 @@ static void share_ports(const struct files_work *work)
 
 	for (uint32_t i = 0; i < work->want->count; i++)
 		if (is_lost_listener(work, i))
-			wanted[port_of(&work->want->file[i].socket->local)] = true;
+			wanted[port_number(&work->want->file[i].socket->local)] = true;
 	for (uint32_t k = 0; k < work->now->count; k++) {
 		struct sockaddr_storage address = { 0 };
 		socklen_t bytes = sizeof address;
@@ -330,8 +329,7 @@ static void share_ports(const struct files_work *work)
 		(void)budget_step();
 		fd = proc_borrow_fd(work->table_pidfd, work->now->file[k].fd);
 		if (fd >= 0 && getsockname(fd, (struct sockaddr *)&address, &bytes) == 0 &&
-		    (address.ss_family == AF_INET || address.ss_family == AF_INET6) &&
-		    wanted[port_of(&address)])
+		    address_port(&address) && wanted[port_number(&address)])
 			setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);
 		close_fd(&fd);
 	}

@@ -825,10 +825,12 @@ static bool is_tcp(const struct file *f)
 	return f->socket && f->socket->protocol == IPPROTO_TCP;
 }
 
-static int port_of(const struct file *f)
+uint32_t address_port(const struct sockaddr_storage *address)
 {
-	/* The port is at the same place in an IPv6 address. */
-	return ntohs(((const struct sockaddr_in *)&f->socket->local)->sin_port);
+	/* It is at the same place in an IPv6 address. */
+	return address->ss_family == AF_INET || address->ss_family == AF_INET6
+		       ? ntohs(((const struct sockaddr_in *)address)->sin_port)
+		       : 0;
 }
 
 void files_find_accepted(struct files *files)
@@ -837,10 +839,10 @@ void files_find_accepted(struct files *files)
 
 	for (uint32_t i = 0; i < files->count; i++)
 		if (is_tcp(&files->file[i]) && files->file[i].socket->listening)
-			listening[port_of(&files->file[i])] = true;
+			listening[address_port(&files->file[i].socket->local)] = true;
 	for (uint32_t i = 0; i < files->count; i++)
 		files->file[i].accepted = is_tcp(&files->file[i]) &&
-					  listening[port_of(&files->file[i])];
+					  listening[address_port(&files->file[i].socket->local)];
 }
 
 bool file_tcp_is_cut(const struct file *f)
