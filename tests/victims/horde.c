@@ -1,10 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * horde N KIND [again]: has so many descriptors from the start: dups of one file; pipes; ends of one pipe;
- * eventfds; streams (connected to sockets of its own that accept nothing); datagrams (connected to one
- * of its own); listeners; ports (TCP); locks
- * of one file; watches of one epoll set, all by the same number.  SIGUSR1 closes them all, opens as many others where it is to do it
- * again, and counts that in counter[0].  Beats every 1 ms.
+ * horde N KIND [again]: has so many descriptors from the start: pipes; ends of one pipe; streams
+ * (connected to sockets of its own that accept nothing); datagrams (connected to one of its own);
+ * listeners; ports (TCP); or locks of one file; or watches of one epoll set, all by the same number.
+ * SIGUSR1 closes them all, opens as many others where it is to do it again, and counts that in
+ * counter[0].  Beats every 1 ms.
  */
 #include <netinet/in.h>
 #include <signal.h>
@@ -105,9 +105,7 @@ static void open_all(int n, const char *kind)
 	int ends[2], set = -1, first = fcntl(memfd_create("horde", 0), F_DUPFD, FIRST);
 
 	for (int i = 0; i < n; i++)
-		if (!strcmp(kind, "dups"))
-			must(dup(first) >= 0, "dup");
-		else if (!strcmp(kind, "pipes"))
+		if (!strcmp(kind, "pipes"))
 			must(i % 2 || !pipe(ends), "pipe");
 		else if (!strcmp(kind, "ends") && !i)
 			must(!pipe(ends), "pipe");
@@ -119,8 +117,6 @@ static void open_all(int n, const char *kind)
 			watch(&set, first);
 		else if (!strcmp(kind, "ports"))
 			port();
-		else if (!strcmp(kind, "eventfds"))
-			must(eventfd(0, 0) >= 0, "eventfd");
 		else if (!strcmp(kind, "streams"))
 			client(i / BACKLOG, SOCK_STREAM);
 		else if (!strcmp(kind, "datagrams"))

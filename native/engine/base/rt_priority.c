@@ -88,12 +88,18 @@ bool rt_priority_lend(pid_t pid)
 	       sched_setscheduler(pid, SCHED_FIFO | SCHED_RESET_ON_FORK, &lowest) == 0;
 }
 
-void rt_priority_reclaim(pid_t pid)
+/* If it still has that policy. */
+static void take_back(pid_t pid, int policy)
 {
 	const struct sched_param none = { 0 };
 
-	if (pid > 0 && sched_getscheduler(pid) == (SCHED_FIFO | SCHED_RESET_ON_FORK))
+	if (pid > 0 && sched_getscheduler(pid) == policy)
 		sched_setscheduler(pid, SCHED_OTHER, &none);
+}
+
+void rt_priority_reclaim(pid_t pid)
+{
+	take_back(pid, SCHED_FIFO | SCHED_RESET_ON_FORK);
 }
 
 void rt_priority_begin_lent(void)
@@ -113,10 +119,7 @@ bool rt_priority_is(void)
 
 void rt_priority_unshare(pid_t tid)
 {
-	const struct sched_param none = { 0 };
-
-	if (sched_getscheduler(tid) == SCHED_FIFO)
-		sched_setscheduler(tid, SCHED_OTHER, &none);
+	take_back(tid, SCHED_FIFO);
 }
 
 void rt_priority_share(pid_t tid)

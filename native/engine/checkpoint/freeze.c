@@ -412,8 +412,7 @@ static void let_go(struct freeze *freeze)
 		if (freeze->generation->image[0].template && main_thread->borrowed)
 			(void)freeze_park_main(main, main_thread,
 					       &ignored); /* or it is killed just now */
-		if (!write_is_cut(main_thread))
-			thread_let_go(main, main_thread);
+		thread_let_go_uncut(main, main_thread);
 	}
 	for (uint32_t i = 0; i < freeze->tree->processes; i++)
 		process_let_go(freeze->tree->process[i]);

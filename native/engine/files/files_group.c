@@ -331,28 +331,18 @@ static bool has_other(const struct file *f, const struct pairs *pairs)
 	return pairs->bit[bit / 64] >> bit % 64 & 1;
 }
 
-static bool find_pairs(struct pairs *pairs, const struct image *image, uint32_t images)
+static void mark_pairs(struct pairs *pairs, const struct image *image)
 {
-	for (uint32_t i = 0; i < images; i++) {
-		const struct files *files = image[i].process ? image[i].files : NULL;
+	const struct files *files = image->process ? image->files : NULL;
 
-		for (uint32_t k = 0; files && k < files->count; k++) {
-			uint32_t own, other, bit;
+	for (uint32_t k = 0; files && k < files->count; k++) {
+		uint32_t own, other, bit;
 
-			if (!is_own(&files->file[k], &own, &other))
-				continue;
-			bit = pair_bit(own, other);
-			pairs->bit[bit / 64] |= UINT64_C(1) << bit % 64;
-		}
+		if (!is_own(&files->file[k], &own, &other))
+			continue;
+		bit = pair_bit(own, other);
+		pairs->bit[bit / 64] |= UINT64_C(1) << bit % 64;
 	}
-	for (uint32_t i = 0; i < images; i++) {
-		const struct files *files = image[i].process ? image[i].files : NULL;
-
-		for (uint32_t k = 0; files && k < files->count; k++)
-			if (has_other(&files->file[k], pairs))
-				return true;
-	}
-	return false;
 }
 
 /* ---- a line ------------------------------------------------------------------------------------ */
@@ -512,31 +502,36 @@ void files_ends_keep(struct group_ends *ends, struct avc_board *board)
 	keep(ends, board, COMES_NS);
 }
 
-static void add_own(struct group_ends *ends, const struct image *image, const struct pairs *pairs,
-		    struct avc_board *board)
+/* Most have none: the first one makes `ends` and the board. */
+static void add_own(struct group_ends **ends, const struct image *image, const struct pairs *pairs,
+		    struct avc_board **board)
 {
 	const struct files *files = image->process ? image->files : NULL;
 
-	for (uint32_t k = 0; files && k < files->count; k++)
-		if (has_other(&files->file[k], pairs))
-			add_end(ends, &files->file[k], image->process->pidfd, board);
+	for (uint32_t k = 0; files && k < files->count; k++) {
+		if (!has_other(&files->file[k], pairs))
+			continue;
+		if (!*ends)
+			*ends = calloc(1, sizeof **ends);
+		if (!*board)
+			*board = calloc(1, sizeof **board); /* only what is used takes memory */
+		if (*ends && *board)
+			add_end(*ends, &files->file[k], image->process->pidfd, *board);
+	}
 }
 
 struct group_ends *files_ends_keep_own(const struct image *image, uint32_t images)
 {
 	struct pairs pairs = { 0 };
-	struct group_ends *ends;
-	struct avc_board *board;
+	struct group_ends *ends = NULL;
+	struct avc_board *board = NULL;
 
-	if (!find_pairs(&pairs, image, images))
-		return NULL;
-	ends = calloc(1, sizeof *ends);
-	board = calloc(1, sizeof *board); /* only what is used takes memory */
-	if (ends && board) {
-		for (uint32_t i = 0; i < images; i++)
-			add_own(ends, &image[i], &pairs, board);
+	for (uint32_t i = 0; i < images; i++)
+		mark_pairs(&pairs, &image[i]);
+	for (uint32_t i = 0; i < images; i++)
+		add_own(&ends, &image[i], &pairs, &board);
+	if (ends && board)
 		keep(ends, board, STEP_NS);
-	}
 	free(board);
 	return ends;
 }

@@ -654,10 +654,7 @@ static int do_stopped(struct process *process, uint32_t slots, timer_t timer, ui
 	if (thread)
 		result = slots ? infect_thread(process, thread, slots, err)
 			       : process_hold_stopped(process, process->init, err);
-	process_let_go(process);
-	tracee_deadline_clear(timer);
-	rt_priority_end();
-	writes_finish(process);
+	process_go_on(process, timer);
 	return result;
 }
 
@@ -676,8 +673,8 @@ int process_infect(struct process *process, uint32_t slots, timer_t timer, uint6
 	if (process_check_dying(process, err) == 0)
 		thread = stop_main(process, err);
 	result = thread ? infect_thread(process, thread, slots, err) : -1;
-	if (thread && !write_is_cut(thread))
-		thread_let_go(process, thread);
+	if (thread)
+		thread_let_go_uncut(process, thread);
 	tracee_deadline_clear(timer);
 	rt_priority_end();
 	writes_finish(process);
@@ -794,10 +791,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	tracee_deadline_set(timer, deadline_ns);
 	thread = stop_all(process, err);
 	if (!thread) {
-		process_let_go(process);
-		tracee_deadline_clear(timer);
-		rt_priority_end();
-		writes_finish(process);
+		process_go_on(process, timer);
 		return -1;
 	}
 	call_begin(call, INJ_AFTER_HOME);
@@ -813,10 +807,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 		thread->stopped = false; /* on its way through the parasite, and back */
 	if (!result)
 		result = thread_give_back(thread, err);
-	process_let_go(process);
-	tracee_deadline_clear(timer);
-	rt_priority_end();
-	writes_finish(process);
+	process_go_on(process, timer);
 	if (!holder)
 		return -1;
 	/* It must never run by itself: its stack is the app's memory. */

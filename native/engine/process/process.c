@@ -533,10 +533,7 @@ int process_query_new_threads(struct process *process, timer_t timer, uint64_t d
 		result = process_stop(process, err);
 		if (!result)
 			result = ask_due(process, now_ns() - start, &due, err);
-		process_let_go(process);
-		tracee_deadline_clear(timer);
-		rt_priority_end();
-		writes_finish(process);
+		process_go_on(process, timer);
 	}
 	threads_forget_unseen(process);
 	qsort(process->threads, process->thread_count, sizeof *process->threads, by_inside);

@@ -144,6 +144,9 @@ int process_await(struct process *process, struct avc_error *err) warn_unused;
 int process_stop_all(struct process *process, struct avc_error *err) warn_unused;
 /* All but those whose write is cut short: writes_finish() is for them. */
 void process_let_go(struct process *process);
+/* Ends a stop of the whole process that began with rt_priority_begin() and tracee_deadline_set(): all run
+ * again. */
+void process_go_on(struct process *process, timer_t timer);
 
 /* ---- infect.c ----------------------------------------------------------------- */
 
@@ -279,8 +282,9 @@ void waits_end(struct process *process, timer_t timer);
 
 /* ---- writes.c ---------------------------------------------------------------------- */
 
-/* Whether the thread has been stopped in a write(2) and has not written everything. */
-bool write_is_cut(const struct thread *thread);
+/* Unless it has been stopped in a write(2) and has not written everything: that is for
+ * writes_finish(). */
+void thread_let_go_uncut(struct process *process, struct thread *thread);
 /* After process_let_go(): releases these threads as well; before that, writes the rest if it was into a
  * pipe.  Everything else runs, those that read, too; takes a second at most. */
 void writes_finish(struct process *process);

@@ -28,7 +28,7 @@
 #define WRITE_MAX UINT64_C(0x7ffff000) /* MAX_RW_COUNT of the kernel */
 
 /* Its registers still say what it was called with: not where the result replaces an argument. */
-bool write_is_cut(const struct thread *thread)
+static bool is_cut(const struct thread *thread)
 {
 	const struct arch_regs *regs = &thread->regs;
 	const long result = arch_syscall_result(regs);
@@ -37,6 +37,12 @@ bool write_is_cut(const struct thread *thread)
 	       !thread->signalled && !thread->stop_signal && arch_syscall_nr(regs) == SYS_write &&
 	       result > 0 && (uint64_t)result < arch_syscall_arg(regs, 2) &&
 	       (uint64_t)result < WRITE_MAX;
+}
+
+void thread_let_go_uncut(struct process *process, struct thread *thread)
+{
+	if (!is_cut(thread))
+		thread_let_go(process, thread);
 }
 
 static bool is_blocking_pipe(int fd)
@@ -107,7 +113,7 @@ static void finish(struct process *process, struct thread *thread, uint64_t end)
 {
 	int fd = -1;
 
-	if (write_is_cut(thread))
+	if (is_cut(thread))
 		fd = (int)syscall(SYS_pidfd_getfd, process->pidfd,
 				  (int)arch_syscall_arg(&thread->regs, 0), 0);
 	if (fd >= 0 && is_blocking_pipe(fd))

@@ -8,7 +8,6 @@ import http.client
 import json
 import os
 import socket
-import struct
 from collections.abc import Iterator
 from http import HTTPStatus
 from pathlib import Path
@@ -78,12 +77,11 @@ class Client:
 
     def pid(self) -> int:
         """The sidecar's PID as it is here; in `info()` it is that of its own PID namespace."""
+        from avckpt.containers.units import credentials
+
         with self._connected(ANSWER_S) as connection:
             connection.connect()
-            peer: tuple[int, int, int] = struct.unpack(
-                "3i", connection.sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
-            )
-        return peer[0]
+            return credentials(connection.sock)[0]
 
     def containers(self, *, ended: bool = False, memory: bool = True) -> list[Json]:
         """The protected containers, with `ended` also the last few that are gone.

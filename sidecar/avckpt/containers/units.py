@@ -362,7 +362,7 @@ def listen(path: Path) -> socket.socket:
 
 
 def credentials(connection: socket.socket) -> tuple[int, int]:
-    """PID and UID of the process that has connected.  Raises OSError."""
+    """PID and UID of the process at the other end.  Raises OSError."""
     pid, uid, _ = struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
     return pid, uid
 
