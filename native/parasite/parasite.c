@@ -584,10 +584,6 @@ __attribute__((section(".text.entry"))) void inj_restore(struct inj_slot *slot)
 	int32_t last = me->tid;
 	long r;
 
-	if (SYS0(__NR_getpid) != slot->pid) {
-		say(slot, INJ_WRONG_PID);
-		leave();
-	}
 	if (slot->placed) {
 		/* by the engine, because its children need them, too */
 	} else if (slot->session_leader) {

@@ -172,9 +172,8 @@ struct inj_thread {
 
 enum inj_state {
 	INJ_IDLE = 0,
-	INJ_WRONG_PID = 1, /* another process took the PID: try again */
-	INJ_FAILED = 2,    /* error, error_at, error_tid say what               */
-	INJ_READY = 3      /* all threads exist and wait for `go`               */
+	INJ_FAILED = 1, /* error, error_at, error_tid say what               */
+	INJ_READY = 2   /* all threads exist and wait for `go`               */
 };
 
 enum inj_go {

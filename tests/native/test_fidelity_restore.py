@@ -327,10 +327,12 @@ def test_who_has_the_pid_is_told(command: str, of_child: bool, tmp_path: Path) -
             wait_until(lambda: not dead.is_running(), 10, "init has reaped it")
             print(number, file=thief.stdin, flush=True)
             assert int(thief.stdout.readline()) == number
+            (sleeping,) = (child for child in psutil.Process(thief.pid).children(True) if inside(child.pid) == number)
+            wait_until(lambda: sleeping.name() == "sleep", 10, "the shell's child has called exec")
             os.kill(guard.pid, signal.SIGCONT)
             error = guard.wait("gave_up")["error"]["detail"]
         finally:
             os.kill(guard.pid, signal.SIGCONT)
             os.killpg(thief.pid, signal.SIGKILL)
             thief.wait()
-        assert re.fullmatch(rf"PID {number} is taken by process \d+ \(sleep, state S\)", error)
+        assert re.fullmatch(rf"PID {number} is taken by process \d+ \(sleep, state \w\)", error)

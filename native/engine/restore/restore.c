@@ -120,8 +120,8 @@ static int check_memory(struct generation *generation, struct avc_error *err)
 			      "the template that gives it its memory was killed");
 }
 
-/* One fork of the template, or the process that takes over its spare's memory.  If it is to have
- * children, it stays stopped. */
+/* One fork of the template, or the process that takes over its spare's memory; restore->pid stays 0 if
+ * it has another number.  If it is to have children, it stays stopped. */
 static int fork_template(struct restore *restore, bool again, struct avc_error *err)
 {
 	struct generation *generation = restore->generation;
@@ -152,12 +152,12 @@ static int fork_template(struct restore *restore, bool again, struct avc_error *
 		tracee_kill(child);
 		return -1;
 	}
-	files_lift_limit(image->files, child);
-	if (restore->tree && proc_inside(child) != slot->pid) {
+	/* Another process's fork took the number.  It never runs: its stack is the next one's. */
+	if (proc_inside(child) != slot->pid) {
 		tracee_kill(child);
-		slot->state = INJ_WRONG_PID;
 		return tracee_settle(from, err);
 	}
+	files_lift_limit(image->files, child);
 	if (!restore->tree && send_off(image, child, &restore->sandbox, err))
 		return -1;
 	restore->pid = child;
@@ -293,8 +293,10 @@ static int rebuild(struct restore *restore, struct avc_error *err)
 				continue;
 			break;
 		}
+		if (!restore->pid)
+			continue;
 		restore->fork_ns = now_ns() - start;
-		if (restore->tree && slot->state == INJ_IDLE) {
+		if (restore->tree) {
 			if (restore_tree_make(restore->tree, err) ||
 			    restore_tree_begin(restore->tree, err) ||
 			    send_off(image, restore->pid, &restore->sandbox, err))
@@ -310,8 +312,7 @@ static int rebuild(struct restore *restore, struct avc_error *err)
 		if (restore->sandbox)
 			sandbox_end(restore->sandbox);
 		restore->sandbox = NULL;
-		if (slot->state == INJ_FAILED)
-			return describe_failure(parasite, slot, err);
+		return describe_failure(parasite, slot, err);
 	}
 	if (failed.code) {
 		*err = failed;
