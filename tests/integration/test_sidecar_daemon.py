@@ -588,17 +588,17 @@ def test_sockets_are_for_root_only(local: LocalSidecar) -> None:
 
 @SHARED
 def test_an_idle_sidecar_sleeps(local: LocalSidecar) -> None:
-    """At most a handful of wake-ups: a periodic task would be visible."""
+    """At most a handful of wake-ups: a periodic task would be visible, whatever other tests' dying processes wake."""
     assert local.process is not None
     path = Path(f"/proc/{local.process.pid}/status")
 
-    def switches() -> int:
-        return int(path.read_text().split("voluntary_ctxt_switches:")[1].split()[0])
+    def switches_of_3_s() -> int:
+        before = int(path.read_text().split("voluntary_ctxt_switches:")[1].split()[0])
+        time.sleep(3)
+        return int(path.read_text().split("voluntary_ctxt_switches:")[1].split()[0]) - before
 
     time.sleep(0.5)
-    before = switches()
-    time.sleep(3)
-    assert switches() - before <= 2
+    assert any(switches_of_3_s() <= 2 for _ in range(5))
 
 
 def test_info(local: LocalSidecar) -> None:
