@@ -111,12 +111,16 @@ def test_what_is_left_of_old_templates_is_reaped(tmp_path: Path) -> None:
         wait_until(lambda: templates_of(victim) <= 2, 5, "old templates go")
 
 
-@pytest.mark.parametrize("command", ["threads 4 20 --no-churn", "tree 8"])
-def test_templates_that_go_with_their_container_are_no_news(command: str, tmp_path: Path) -> None:
-    with Victim(command, tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
-        guard.wait("checkpoint", count=4)
+@pytest.mark.parametrize("signum", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("command", ["threads 4 20 --no-churn", "idle 8 64", "tree 8"])
+def test_templates_that_go_with_their_container_are_no_news(
+    command: str, signum: signal.Signals, tmp_path: Path
+) -> None:
+    """Also where the application is asked to end, and init tells of it while the templates go."""
+    with Victim(command, tmp_path) as victim, GuardProcess(config(0.05, keep=16), [victim.pid]) as guard:
+        guard.wait("checkpoint", count=16)
         since = guard.mark()
-        os.kill(victim.pid, signal.SIGKILL)
+        os.kill(victim.pid, signum)
         guard.wait("ended", since=since)
         assert not [event for event in guard.events[since:] if event.get("kind") == "dropped"]
 

@@ -434,7 +434,8 @@ void guard_reap_dead(struct avc_guard *guard)
 		if (news[1].revents)
 			news[1].fd = -1; /* init is just ending */
 	}
-	for (uint32_t i = 0; i < count; i++)
+	/* It had reported a death that it does not undo. */
+	for (uint32_t i = 0; i < count && !proc_is_killed(guard->channel.init); i++)
 		guard_emit(guard, &events[i]);
 }
 
