@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""avckpt.interval=auto: the guard decides how often, and when."""
+"""avckpt.interval=auto: the guard decides how often, and when; and what holds for any interval."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
+from avckpt.guard import Images
 
 from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config, since_linux
 from testkit.harness import app_pid, wait_until
@@ -132,3 +133,14 @@ def test_a_fault_that_shows_late_needs_older_ones(tmp_path: Path, apart_s: float
             return
         guard.wait_for(lambda event: event["kind"] == "restored" and event["age_s"] > 0.5, "an older one")
         victim.wait_beats(1000)
+
+
+def test_it_runs_for_as_long_as_it_was_stopped(tmp_path: Path) -> None:
+    """Where a freeze takes longer than the interval."""
+    often = config(0.001, images=Images.FORK)
+    with Victim("idle 200 4", tmp_path) as victim, GuardProcess(often, [victim.pid]) as guard:
+        guard.wait("checkpoint", count=40)
+        taken = [event for event in guard.events if event["kind"] == "checkpoint"]
+    frozen_s = sum(event["freeze_s"] for event in taken[:-1])
+    assert frozen_s / len(taken) > 0.001
+    assert (taken[-1]["at_ns"] - taken[0]["at_ns"]) / 1e9 > 1.9 * frozen_s

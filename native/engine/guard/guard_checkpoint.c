@@ -531,7 +531,7 @@ static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_ev
 	budget_deadline(0);
 	if (!result)
 		result = budget_check(guard->main.pid, err);
-	guard->pace_held_ns += freeze->freeze_ns;
+	guard->held_ns += freeze->freeze_ns;
 	event->freeze_ns = freeze->freeze_ns;
 	event->stop_ns = freeze->stop_ns;
 	event->clone_ns = freeze->clone_ns;
@@ -638,11 +638,21 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 	}
 }
 
+/* However short its interval is: the app runs for at least as long as it was just stopped. */
+static void let_it_run(struct avc_guard *guard)
+{
+	const uint64_t until = now_ns() + guard->held_ns;
+
+	if (guard->next_ns < until)
+		guard->next_ns = until;
+}
+
 /* One was missed.  avckpt.interval=auto has pauses of its own (guard_pace_missed()). */
 static void try_soon(struct avc_guard *guard)
 {
 	if (!policy_is_automatic(&guard->config))
 		guard->next_ns = policy_without(&guard->policy, guard->next_ns, now_ns());
+	let_it_run(guard);
 }
 
 void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
@@ -664,6 +674,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 				     "memory is short, so no generation is held");
 		return;
 	}
+	guard->held_ns = 0;
 	if (guard_app_is_full(guard)) {
 		fail(&error, AVC_LIMIT, 0, guard->main.pid, "checkpoint", "",
 		     "it fills the memory of its container: what it had before is kept");
@@ -673,7 +684,6 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 	}
 	if (ticket)
 		policy_retry(&guard->policy);
-	guard->pace_held_ns = 0;
 	guard_pace_begin(guard);
 	taken = take(guard, &event, &error) == 0;
 	if (taken) {
@@ -681,6 +691,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		event.app_pid = guard->main.leader;
 		event.app_pid_inside = guard->main.inside;
 		guard_pace_taken(guard, &event);
+		let_it_run(guard);
 		faults_settle(&guard->faults, &guard->tree, guard->next_ns);
 		guard_tell_taken(guard, &event);
 		guard->unprotected = false;

@@ -97,7 +97,7 @@ void guard_pace_taken(struct avc_guard *guard, const struct avc_event *event)
 	guard_pace_end(guard);
 	/* Making the template, and freeing it later. */
 	cost.cpu_ns = guard->pace_cpu_ns + 2 * event->clone_ns;
-	cost.held_ns = guard->pace_held_ns + faults_ns(guard, event->freeze_ns);
+	cost.held_ns = guard->held_ns + faults_ns(guard, event->freeze_ns);
 	guard->pace_cpu_ns = 0;
 	policy_pay(&guard->pace, &guard->config,
 		   event->images == AVC_IMAGES_FORK ? POLICY_FORKS : POLICY_COPIES, cost, now_ns());
@@ -108,7 +108,7 @@ void guard_pace_taken(struct avc_guard *guard, const struct avc_event *event)
  * longer than a fixed interval would be. */
 static uint64_t paid_for(const struct avc_guard *guard)
 {
-	const uint64_t pause = guard->pace_held_ns * 1000000 / guard->config.budget_freeze_ppm,
+	const uint64_t pause = guard->held_ns * 1000000 / guard->config.budget_freeze_ppm,
 		       longest = guard->config.interval_ns;
 
 	return now_ns() + (pause < longest ? pause : longest);
