@@ -40,6 +40,7 @@ from avckpt.containers.process import has_ended, is_foreign, pid_of
 from avckpt.containers.protected import Protected, State
 from avckpt.containers.records import NOT_SEEN, Records
 from avckpt.containers.registry import Registry
+from avckpt.containers.strangers import let_go
 from avckpt.engine import Engine, Guard
 from avckpt.engine import version as native_version
 from avckpt.errors import (
@@ -406,7 +407,7 @@ class Daemon:
             raise TargetGone("it has just ended")
         watch = self._watches[known.cookie]
         if watch.connection is not None:
-            watch.connection.close()
+            let_go(watch.connection.detach())
         watch.connection = peer.connection
         os.close(peer.pidfd)
 
@@ -635,7 +636,7 @@ class Daemon:
         ended = has_ended(watch.pidfd)
         os.close(watch.pidfd)
         if watch.connection is not None:
-            watch.connection.close()
+            let_go(watch.connection.detach())
         del self._watches[container.cookie]
         self.registry.remove(container)
         self._names.forget(container.id, container.init_pid)

@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from avckpt.artifacts import init_binary
 
@@ -179,6 +180,84 @@ def test_requests_of_anybody_fill_no_log(local: LocalSidecar, start: Any) -> Non
     assert 0 < local.log.count("refused a unit") < 30
     start("--name", "counter", *QUICK, "--", *COUNT)
     row(local, "host/counter", state="protected")
+
+
+LINGERING = """
+import os, socket, struct, sys
+
+def lingering():
+    # Full, and to be waited for by whoever closes it last.
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.listen()
+        ours = socket.create_connection(listening.getsockname())
+        theirs.append(listening.accept()[0])
+    ours.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 60))
+    ours.setblocking(False)
+    try:
+        while True:
+            ours.send(bytes(65536))
+    except BlockingIOError:
+        return ours.detach()
+
+def connect():
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    connection.connect(sys.argv[2])
+    return connection
+
+def send(connection, said, *fds):
+    connection.sendmsg([said], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, struct.pack(f"{len(fds)}i", *fds))])
+    for fd in fds:
+        os.close(fd)
+
+theirs, how = [], sys.argv[1]
+if how != "ends":
+    print("stop it", flush=True)
+    sys.stdin.readline()
+    others = [connect() for _ in range(16 if how == "unread" else 0)]
+    connection = connect()
+    if how == "behind":
+        connection.send(b"nonsense")
+    send(connection, b"avckpt-unit 1\\0name=a\\0", *(lingering() for _ in range(6 if how == "many" else 1)))
+else:
+    connection = connect()
+    send(connection, b"avckpt-unit 1\\0name=a\\0label=avckpt.interval=1h\\0", os.pidfd_open(os.getpid()))
+    assert connection.recv(100) == b"ok"
+    send(connection, b"x", lingering())
+    if os.fork():
+        os._exit(0)
+print("sent", flush=True)
+sys.stdin.readline()
+"""
+
+
+@SHARED
+@pytest.mark.parametrize("how", ["claims", "many", "behind", "unread", "ends"])
+def test_nobody_waits_for_what_strangers_send(local: LocalSidecar, how: str) -> None:
+    path = local.run_dir / "units" / "units.sock"
+    daemon = local.client.info()["pid"]
+    with subprocess.Popen(
+        [sys.executable, "-c", LINGERING, how, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as stranger:
+        assert stranger.stdin is not None
+        assert stranger.stdout is not None
+        if how != "ends":
+            assert stranger.stdout.readline() == "stop it\n"
+            os.kill(daemon, signal.SIGSTOP)  # so that all of it is there when it looks
+            stranger.stdin.write("\n")
+            stranger.stdin.flush()
+        assert stranger.stdout.readline() == "sent\n"
+        os.kill(daemon, signal.SIGCONT)
+        if how == "ends":
+            wait_until(lambda: local.ps(ended=True)[0]["ended_at"], 5, "its end")
+        used_s = sum(psutil.Process(daemon).cpu_times()[:2])
+        for _ in range(10):
+            began = time.monotonic()
+            local.client.info()
+            assert time.monotonic() - began < 1
+            time.sleep(0.1)
+        assert sum(psutil.Process(daemon).cpu_times()[:2]) - used_s < 0.5
+        stranger.stdin.write("\n")
 
 
 @SHARED

@@ -110,6 +110,11 @@ def has_ended(pidfd: int) -> bool:
     return bool(poller.poll(0))
 
 
+def is_pidfd(fd: int) -> bool:
+    """Whether a descriptor is a pidfd.  Asks nothing of the file itself."""
+    return os.readlink(f"/proc/self/fd/{fd}") == "anon_inode:[pidfd]"
+
+
 def is_foreign(pidfd: int) -> bool:
     """Whether the process is in a PID namespace that is neither ours nor below ours."""
     return _fdinfo_pid(pidfd) == 0

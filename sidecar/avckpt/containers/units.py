@@ -10,6 +10,7 @@ avckpt.scope=nodes.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
 import logging
 import os
@@ -25,7 +26,8 @@ from avckpt_hooks.shared.labels import LABELS, SHM_MAX_BYTES, LabelError, parse_
 from avckpt_hooks.shared.protocol import ProtocolError, received_fds
 
 from avckpt.bucket import Bucket
-from avckpt.containers.process import has_ended, is_foreign, pid_of, start_time, status
+from avckpt.containers.process import has_ended, is_foreign, is_pidfd, pid_of, start_time, status
+from avckpt.containers.strangers import let_go
 from avckpt.errors import AvckptError, Busy, Denied, LabelsWrong, TargetGone, of_any
 
 log = logging.getLogger("avckpt")
@@ -34,6 +36,8 @@ UNIT_BYTES = 16384
 """Longest packet; PACKET_MAX of native/init/unit.c."""
 GREETING = b"avckpt-unit 1"
 FIELDS_MOST = 64
+SCM_MAX_FD = 253
+"""Descriptors in one packet, include/net/scm.h."""
 MAX_WAITING = 64
 """Connections that have not sent their request yet, ..."""
 MAX_WAITING_EACH = 16
@@ -47,6 +51,8 @@ CONNECTIONS_MOST = 1024
 """Of one user of a PID namespace, at once, ..."""
 CONNECTIONS_PER_S = 16.0
 """... and further ones; the rest are closed unread."""
+LEAVE_S = 0.02
+"""Then what was hung up meanwhile is closed."""
 PEERS_MOST = 256
 """Such users that are remembered."""
 REFUSALS_TOLD = 16
@@ -163,7 +169,9 @@ def unique_name(name: str, taken: Iterable[str]) -> str:
 
 
 def check_sender(pidfd: int, pid: int) -> None:
-    """Whether a pidfd is of the process that has connected.  Raises AvckptError."""
+    """Whether a descriptor is a pidfd of the process that has connected.  Raises AvckptError."""
+    if not is_pidfd(pidfd):  # which others may have to be asked for whether they are readable
+        raise Denied("its descriptor is not one of a process")
     if has_ended(pidfd):
         raise TargetGone("it has ended already")
     if is_foreign(pidfd):
@@ -269,16 +277,17 @@ class UnitListener:
         """By PID namespace and user."""
         self._refusals = Bucket(REFUSALS_TOLD, 1 / REFUSAL_S)
         self._untold = 0
+        self._leaving: list[socket.socket] = []
         self._socket = listen(path)
         self._loop.add_reader(self._socket, self._accept)
 
     def close(self) -> None:
         """Closes every connection that is not a unit's yet, and removes the socket."""
         self._loop.remove_reader(self._socket)
-        self._socket.close()
         for connection in list(self._waiting):
-            self._forget(connection)
-            connection.close()
+            self._drop(connection)
+        self._leaving.append(self._socket)  # with all that wait to be accepted
+        self._leave()
         self._path.unlink(missing_ok=True)
 
     def _accept(self) -> None:
@@ -296,11 +305,11 @@ class UnitListener:
             pid, uid = credentials(connection)
             space = pid_namespace(pid)
         except OSError:
-            connection.close()
+            self._part(connection)
             return
         each = sum(1 for _, other in self._waiting.values() if other == space)
         if len(self._waiting) >= MAX_WAITING or each >= MAX_WAITING_EACH or not self._may_ask(space, uid):
-            connection.close()  # it tries again
+            self._part(connection)  # it tries again
             return
         timer = self._loop.call_later(WAIT_S, self._drop, connection)
         self._waiting[connection] = timer, space
@@ -322,8 +331,10 @@ class UnitListener:
             answer = serve(connection, self._handler)
         except BlockingIOError:
             return  # not readable after all
-        self._forget(connection)
-        if answer is not None:
+        if answer is None:
+            self._forget(connection)
+        else:
+            self._drop(connection)
             self._tell(answer.partition(" ")[2])
 
     def _tell(self, refusal: str) -> None:
@@ -336,7 +347,19 @@ class UnitListener:
 
     def _drop(self, connection: socket.socket) -> None:
         self._forget(connection)
-        connection.close()
+        self._part(connection)
+
+    def _part(self, connection: socket.socket) -> None:
+        """Hangs up, and closes it soon: many together cost little more than one."""
+        with contextlib.suppress(OSError):
+            connection.shutdown(socket.SHUT_RDWR)
+        if not self._leaving:
+            self._loop.call_later(LEAVE_S, self._leave)
+        self._leaving.append(connection)
+
+    def _leave(self) -> None:
+        let_go(*(connection.detach() for connection in self._leaving))
+        self._leaving.clear()
 
     def _forget(self, connection: socket.socket) -> None:
         waiting = self._waiting.pop(connection, None)
@@ -370,7 +393,7 @@ def credentials(connection: socket.socket) -> tuple[int, int]:
 def serve(connection: socket.socket, handler: Handler) -> str | None:
     """Reads a unit's request, and answers. The refusal, or None: then the connection is the handler's.
 
-    Raises BlockingIOError when there is no request yet.
+    The caller hangs up on who was refused.  Raises BlockingIOError when there is no request yet.
     """
     name = "a unit"
     fds: list[int] = []
@@ -386,19 +409,18 @@ def serve(connection: socket.socket, handler: Handler) -> str | None:
     except BlockingIOError:
         raise
     except (ProtocolError, AvckptError, OSError) as error:
-        for fd in fds:
-            os.close(fd)
         word = "later" if isinstance(error, (Busy, OSError)) else "no"
         why = str(error) if isinstance(error, (ProtocolError, AvckptError)) else str(of_any(error))
         _say(connection, f"{word} {why}")
-        connection.close()
+        let_go(*fds)
         return f"{word} {name}: {why}"
     _say(connection, "ok")
     return None
 
 
 def _receive(connection: socket.socket) -> tuple[Claim, list[int]]:
-    room = socket.CMSG_SPACE(4 * struct.calcsize("i"))
+    # What does not fit, the kernel closes at once, and would have us wait for that.
+    room = socket.CMSG_SPACE(SCM_MAX_FD * struct.calcsize("i"))
     packet, ancillary, flags, _ = connection.recvmsg(UNIT_BYTES, room, socket.MSG_CMSG_CLOEXEC)
     fds = received_fds(ancillary)
     try:
@@ -406,8 +428,7 @@ def _receive(connection: socket.socket) -> tuple[Claim, list[int]]:
             raise ProtocolError("its message is too long")
         return decode_claim(packet), fds
     except ProtocolError:
-        for fd in fds:
-            os.close(fd)
+        let_go(*fds)
         raise
 
 
