@@ -104,6 +104,8 @@ class Watch:
     """A unit's connection: when it closes, avckpt-init looks for another sidecar."""
     units: units.Allowance = field(default_factory=units.Allowance)
     """Of a launcher's container."""
+    space: int = 0
+    """Its PID namespace; 0: it is no launcher's."""
     own_log: ContainerLog = field(default_factory=ContainerLog)
 
     @property
@@ -176,7 +178,8 @@ class Daemon:
             await api.start()
             self._adopt()
             # After the containers that they are in.
-            nodes = units.UnitListener(self.run_dir / "units" / "units.sock", self._register_unit)
+            path = self.run_dir / "units" / "units.sock"
+            nodes = units.UnitListener(path, self._register_unit, self._is_launchers)
             looking = loop.create_task(self._keep_catching_up())
             log.info("avckpt %s is ready, %d container(s) found", __version__, len(self._watches))
             outage = self._presence.since_then(self.registry.live(), self.records.has)
@@ -411,6 +414,9 @@ class Daemon:
         watch.connection = peer.connection
         os.close(peer.pidfd)
 
+    def _is_launchers(self, space: int) -> bool:
+        return any(watch.space == space for watch in self._watches.values())
+
     def _launcher_of(self, pid: int) -> Watch | None:
         """The container of which a process may be a node.  Raises OSError when it is gone."""
         for watch in self._watches.values():
@@ -461,6 +467,8 @@ class Daemon:
             self._start_guard(watch)
         elif settings.policy.enable:
             container.launch()
+            with contextlib.suppress(OSError):  # it has just ended
+                watch.space = units.pid_namespace(container.init_pid)
         else:
             container.listen()
 

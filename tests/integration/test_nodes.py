@@ -182,6 +182,34 @@ def test_requests_of_anybody_fill_no_log(local: LocalSidecar, start: Any) -> Non
     row(local, "host/counter", state="protected")
 
 
+HOG = """
+import os, select, socket, sys
+poller, held = select.poll(), {}
+while True:
+    while len(held) < 20:
+        connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        connection.connect(sys.argv[1])
+        held[connection.fileno()] = connection
+        poller.register(connection, select.POLLIN)
+    for fd, _ in poller.poll():
+        poller.unregister(fd)
+        held.pop(fd).close()
+"""
+
+
+@SHARED
+def test_whoever_makes_namespaces_has_no_more_room_by_it(local: LocalSidecar, start: Any) -> None:
+    path = str(local.run_dir / "units" / "units.sock")
+    with contextlib.ExitStack() as hogs:
+        for _ in range(6):
+            command = ["unshare", "--pid", "--fork", "--kill-child", sys.executable, "-c", HOG, path]
+            hogs.callback(hogs.enter_context(subprocess.Popen(command)).kill)
+        time.sleep(1)
+        for _ in range(3):
+            start("--name", "counter", *QUICK, "--", *COUNT)
+        row(local, "host/counter-3", state="protected")
+
+
 LINGERING = """
 import os, socket, struct, sys
 

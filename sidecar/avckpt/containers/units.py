@@ -38,23 +38,24 @@ GREETING = b"avckpt-unit 1"
 FIELDS_MOST = 64
 SCM_MAX_FD = 253
 """Descriptors in one packet, include/net/scm.h."""
-MAX_WAITING = 64
-"""Connections that have not sent their request yet, ..."""
-MAX_WAITING_EACH = 16
-"""... and of these, of one PID namespace."""
+BACKLOG = 64
+MAX_WAITING = 16
+"""Connections of one party that have not sent their request yet."""
 WAIT_S = 1.0
 UNITS_MOST = 128
 """Of one container, or of the host."""
 REGISTRATIONS_PER_S = 4.0
 """Further registrations per second after UNITS_MOST at once: each starts a guard."""
 CONNECTIONS_MOST = 1024
-"""Of one user of a PID namespace, at once, ..."""
+"""Of one party, at once, ..."""
 CONNECTIONS_PER_S = 16.0
 """... and further ones; the rest are closed unread."""
 LEAVE_S = 0.02
 """Then what was hung up meanwhile is closed."""
-PEERS_MOST = 256
-"""Such users that are remembered."""
+PARTIES_MOST = 256
+"""Remembered."""
+OTHERS = 0
+"""The party of everybody who is neither root of the host nor below a launcher: they are refused, sooner or later."""
 REFUSALS_TOLD = 16
 """Logged at once; ..."""
 REFUSAL_S = 10.0
@@ -267,14 +268,16 @@ refuse."""
 class UnitListener:
     """Accepts units.  Runs in the event loop that is running."""
 
-    def __init__(self, path: Path, handler: Handler) -> None:
+    def __init__(self, path: Path, handler: Handler, is_launchers: Callable[[int], bool]) -> None:
+        """`is_launchers`: whether a PID namespace is that of a container with nodes."""
         self._path = path
         self._handler = handler
+        self._is_launchers = is_launchers
+        self._own_space = pid_namespace(os.getpid())
         self._loop = asyncio.get_running_loop()
         self._waiting: dict[socket.socket, tuple[asyncio.TimerHandle, int]] = {}
-        """And of which PID namespace."""
-        self._peers: OrderedDict[tuple[int, int], Bucket] = OrderedDict()
-        """By PID namespace and user."""
+        """And of which party."""
+        self._parties: OrderedDict[int, Bucket] = OrderedDict()
         self._refusals = Bucket(REFUSALS_TOLD, 1 / REFUSAL_S)
         self._untold = 0
         self._leaving: list[socket.socket] = []
@@ -303,24 +306,30 @@ class UnitListener:
         connection.setblocking(False)
         try:
             pid, uid = credentials(connection)
-            space = pid_namespace(pid)
+            party = self._party(pid_namespace(pid), uid)
         except OSError:
             self._part(connection)
             return
-        each = sum(1 for _, other in self._waiting.values() if other == space)
-        if len(self._waiting) >= MAX_WAITING or each >= MAX_WAITING_EACH or not self._may_ask(space, uid):
+        waiting = sum(1 for _, other in self._waiting.values() if other == party)
+        if waiting >= MAX_WAITING or not self._may_ask(party):
             self._part(connection)  # it tries again
             return
         timer = self._loop.call_later(WAIT_S, self._drop, connection)
-        self._waiting[connection] = timer, space
+        self._waiting[connection] = timer, party
         self._loop.add_reader(connection, self._serve, connection)
 
-    def _may_ask(self, space: int, uid: int) -> bool:
-        peer = self._peers.setdefault((space, uid), Bucket(CONNECTIONS_MOST, CONNECTIONS_PER_S))
-        self._peers.move_to_end((space, uid))
-        if len(self._peers) > PEERS_MOST:
-            self._peers.popitem(last=False)
-        return peer.has_one()
+    def _party(self, space: int, uid: int) -> int:
+        """Who shares what room there is.  Nobody is to get more by making namespaces, or changing its user."""
+        if space == self._own_space:
+            return space if uid == 0 else OTHERS
+        return space if self._is_launchers(space) else OTHERS
+
+    def _may_ask(self, party: int) -> bool:
+        allowance = self._parties.setdefault(party, Bucket(CONNECTIONS_MOST, CONNECTIONS_PER_S))
+        self._parties.move_to_end(party)
+        if len(self._parties) > PARTIES_MOST:
+            self._parties.popitem(last=False)
+        return allowance.has_one()
 
     def _accept_again(self) -> None:
         if self._socket.fileno() >= 0:
@@ -377,7 +386,7 @@ def listen(path: Path) -> socket.socket:
     try:
         listening.bind(str(path))
         path.chmod(0o666)
-        listening.listen(MAX_WAITING)
+        listening.listen(BACKLOG)
     except OSError:
         listening.close()
         raise
