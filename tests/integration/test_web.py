@@ -7,8 +7,10 @@ import contextlib
 import http.client
 import json
 import os
+import resource
 import shutil
 import signal
+import socket
 import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -63,6 +65,7 @@ def site(local: LocalSidecar, *options: str) -> Iterator[Site]:
         [*avckpt_command(), "web", "--port", "0", *options],
         env={**os.environ, **local.env},
         stdout=subprocess.PIPE,
+        stderr=local.run_dir.with_name("web.err").open("w"),
         text=True,
     )
     try:
@@ -191,6 +194,22 @@ def test_strangers_get_nothing(local: LocalSidecar) -> None:
         )
     with site(local, "--control", "--name", "vehicle.example") as page:
         assert page.ask("/v1/containers/x/restore", "POST", Host="vehicle.example")[0] == 404  # no such container
+
+
+def test_strangers_keep_nobody_out_and_fill_no_log(local: LocalSidecar) -> None:
+    with site(local) as served, contextlib.ExitStack() as held:
+        resource.prlimit(served.process.pid, resource.RLIMIT_NOFILE, (64, 64))
+
+        def say(text: bytes) -> None:
+            connection = held.enter_context(socket.create_connection(("127.0.0.1", served.port)))
+            connection.sendall(text)
+
+        for _ in range(10):
+            say(b"\x1b nonsense\r\n\r\n")
+        for _ in range(100):
+            say(b"GET / HT")
+        assert served.ask("/v1/access")[0] == 200
+        assert local.run_dir.with_name("web.err").read_text() == ""
 
 
 def test_a_token_of_the_users_own(local: LocalSidecar, tmp_path: Path) -> None:

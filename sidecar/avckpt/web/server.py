@@ -19,6 +19,7 @@ from __future__ import annotations
 import asyncio
 import hmac
 import ipaddress
+import logging
 import os
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -28,7 +29,9 @@ from pathlib import Path
 
 import aiohttp
 from aiohttp import web
+from aiohttp.http_exceptions import HttpProcessingError
 
+from avckpt.containers.listener import SHORT_OF
 from avckpt.errors import AvckptError, Denied, SidecarUnreachable
 
 PASSED = ("/v1/info", "/v1/containers", "/v1/events", "/v1/history", "/metrics")
@@ -44,6 +47,8 @@ HEADERS = {
     "Cache-Control": "no-store",
 }
 CONNECT_TIMEOUT_S = 5.0
+IDLE_S = 10.0
+"""A connection without a request is closed: anybody can make as many as we have descriptors."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -156,6 +161,12 @@ class WebServer:
             raise web.HTTPBadGateway(reason="the sidecar went away") from None
 
 
+def _is_our_fault(record: logging.LogRecord) -> bool:
+    """Whether it is to be logged: not what strangers send, nor that they have taken all descriptors."""
+    error = record.exc_info[1] if record.exc_info else None
+    return not isinstance(error, HttpProcessingError) and getattr(error, "errno", None) not in SHORT_OF
+
+
 def _is_address(name: str) -> bool:
     try:
         ipaddress.ip_address(name)
@@ -176,7 +187,10 @@ async def start(run_dir: Path, listen: str, port: int, access: Access) -> web.Ap
     """
     if not _may_speak(run_dir / "api.sock"):
         raise Denied(f"{run_dir / 'api.sock'} is for root only: use sudo")
-    runner = web.AppRunner(WebServer(run_dir, access).app, access_log=None, shutdown_timeout=1.0)
+    for name in ("aiohttp.server", "asyncio"):
+        logging.getLogger(name).addFilter(_is_our_fault)
+    app = WebServer(run_dir, access).app
+    runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0, keepalive_timeout=IDLE_S)
     await runner.setup()
     try:
         await web.TCPSite(runner, listen, port).start()
