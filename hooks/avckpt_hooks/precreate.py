@@ -38,6 +38,9 @@ HOOK_TIMEOUT_S = 120
 their own waits to seconds, but on an overloaded machine, for example while it boots, starting Python alone
 may take as long as that."""
 
+LOOKALIKES_TOLD = 16
+"""An image may have as many as it likes, and each takes time."""
+
 _MARK = b'"avckpt.'
 """A JSON text without it contains no label or annotation of ours."""
 _LOOKALIKES = [b'"' + name for name in b"avckpt vckpt ackpt avkpt avcpt avckt avckp vackpt acvkpt avkcpt avcpk".split()]
@@ -104,13 +107,13 @@ def rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) ->
         policy = labels.parse_policy(wanted)
     except labels.LabelError as error:
         raise Refused(f"container {name}: {error}") from error
-    for key in sorted({*given, *annotations}):
-        if labels.LOOKALIKE.match(key) and not key.startswith(labels.PREFIX):
-            meant = labels.meant_by(key)
-            if not meant and not key.lower().startswith("avckpt"):
-                continue
-            hint = f"did you mean {meant}?" if meant else f"avckpt's begin with {labels.PREFIX}"
-            warn(f"container {name}: the label {key} means nothing; {hint}", parent)
+    strange = (key for key in {*given, *annotations} if labels.LOOKALIKE.match(key))
+    for key in sorted(key for key in strange if not key.startswith(labels.PREFIX))[:LOOKALIKES_TOLD]:
+        meant = labels.meant_by(key)
+        if not meant and not key.lower().startswith("avckpt"):
+            continue
+        hint = f"did you mean {meant}?" if meant else f"avckpt's begin with {labels.PREFIX}"
+        warn(f"container {name}: the label {key} means nothing; {hint}", parent)
     if not policy.enable and not (policy.listens and _is_ours()):
         return config
     annotations = {**annotations, **wanted, "avckpt.name": name, "avckpt.version": VERSION}

@@ -54,12 +54,16 @@ def register(state: dict[str, Any]) -> str:
             # Those of others may be longer than a packet.
             annotations={key: value for key, value in state["annotations"].items() if key.startswith("avckpt.")},
         )
+        try:
+            packet = registration.encode()
+        except protocol.ProtocolError as error:  # no sidecar would read such a record, either
+            return f"runs unprotected: its labels are too large for the sidecar: {error}"
         unwritten = ""
         try:
             write_record(registration)
         except OSError as error:
             unwritten = f"{protocol.records_dir()} cannot be written ({error.strerror})"
-        refusal = ask(registration, pidfd)
+        refusal = ask(packet, pidfd)
     finally:
         os.close(pidfd)
     if refusal:
@@ -67,12 +71,8 @@ def register(state: dict[str, Any]) -> str:
     return f"is not known to a sidecar that starts later: {unwritten}" if unwritten else ""
 
 
-def ask(registration: protocol.Register, pidfd: int) -> str:
+def ask(packet: bytes, pidfd: int) -> str:
     """Asks the sidecar to protect the container.  Returns why it does not, or ""."""
-    try:
-        packet = registration.encode()
-    except protocol.ProtocolError as error:
-        return f"its labels are too large for the sidecar: {error}"
     try:
         refusal = protocol.exchange(packet, pidfd)
     except TimeoutError:

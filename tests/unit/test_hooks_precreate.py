@@ -204,6 +204,15 @@ def test_a_label_that_looks_like_one_of_ours_is_said(hook: Hook, key: str, hint:
     assert f"the label {key} means nothing" in hook(json.dumps(annotated).encode(), None).said
 
 
+def test_an_image_cannot_have_warnings_without_end(hook: Hook) -> None:
+    config, spec = sample("labelled")
+    about = json.loads(spec)
+    about["labels"].update({f"avckpt-{i}": "true" for i in range(20000)})
+    result = hook(config, json.dumps(about))
+    assert result.status == 0
+    assert result.said.count("means nothing") == 16
+
+
 def test_a_client_of_the_rest_service_finds_the_reason_in_the_configuration(hook: Hook) -> None:
     config, spec = sample("labelled")
     result = hook(config, with_labels(spec, enable="true", keep="99"), ("system", "service"))

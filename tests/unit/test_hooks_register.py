@@ -179,6 +179,8 @@ def test_prestart_sends_what_is_ours_and_says_when_that_is_too_long(
         assert (said, seen) == ("", [ours])
     else:
         assert "web runs unprotected: its labels are too large for the sidecar: the message is too long (131" in said
+        # Nor is such a record left in memory for a sidecar that starts later and could not read it.
+        assert not os.path.exists(protocol.record_path(ID))
 
 
 def test_prestart_registers_also_without_a_record(
