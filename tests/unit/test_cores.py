@@ -5,9 +5,23 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+from avckpt.evidence import cores
 from avckpt.evidence.cores import KEPT_BYTES, KEPT_OF_EACH, KEPT_S, SUFFIX, Cores
+
+
+@pytest.fixture(autouse=True)
+def free(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """Says how much is free beside the files."""
+
+    def say(size: int) -> None:
+        monkeypatch.setattr(cores, "_free_bytes", lambda _: size, raising=False)
+
+    say(10 * KEPT_BYTES)
+    return say
 
 
 def core(folder: Path, name: str, age_s: float, size: int = 1000) -> Path:
@@ -38,6 +52,22 @@ def test_all_together_are_bounded(tmp_path: Path) -> None:
     for age in (1, 2, 3):
         core(tmp_path, f"c{age}", age, KEPT_BYTES // 3)
     assert left(tmp_path, core(tmp_path, "web", 0, KEPT_BYTES // 3)) == {"web.0", "c1.1", "c2.2"}
+
+
+def test_half_of_what_is_free_is_left_to_others(tmp_path: Path, free: Callable[[int], None]) -> None:
+    for age in (1, 2, 3):
+        core(tmp_path, f"c{age}", age, 1000)
+    free(2000)
+    assert left(tmp_path, core(tmp_path, "web", 0, 1000)) == {"web.0", "c1.1", "c2.2"}
+    free(0)
+    assert left(tmp_path, core(tmp_path, "web", 0, 1000)) == {"web.0"}
+
+
+def test_one_container_has_at_most_half_of_the_room(tmp_path: Path) -> None:
+    core(tmp_path, "other", 5, KEPT_BYTES // 3)
+    for age in (1, 2, 3):
+        core(tmp_path, "web", age, KEPT_BYTES // 5)
+    assert left(tmp_path, core(tmp_path, "web", 0, KEPT_BYTES // 5)) == {"web.0", "web.1", "other.5"}
 
 
 def test_old_ones_go(tmp_path: Path) -> None:

@@ -6,11 +6,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import os
 import platform
 import re
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +28,10 @@ from avckpt.policy import REMAINS_S
 KEPT_OF_EACH = 5
 """Of one container; the oldest make way."""
 KEPT_BYTES = 1_000_000_000
-"""Of all together."""
+"""Of all together, if that is not more than half of what is free without them; of one container, half of it."""
 KEPT_S = 7 * 86400.0
 BYTES_MAX = 500_000_000
-"""Of one, compressed."""
+"""Of one, compressed; of those that are being written, not more than half of what is free."""
 CRAMPED = 0.9
 """Of its limit a container may use at most so much, while the memory of the dead is kept, too."""
 AT_ONCE = 2
@@ -61,7 +62,9 @@ class Cores:
             try:
                 keep_private(self._folder)
                 path = self._folder / f"{_file_name(container.label)}.{int(time.time() * 1000)}{SUFFIX}"
-                answer = await _written(_request(case, path, mode, left_s, crash.command), left_s)
+                bytes_max = min(BYTES_MAX, _free_bytes(self._folder) // 2 // AT_ONCE)
+                request = _request(case, path, mode, left_s, crash.command)
+                answer = await _written(replace(request, bytes_max=bytes_max), left_s)
             except (OSError, ValueError, asyncio.TimeoutError) as error:
                 return "", 0, f"no core: {printable(str(error)) or 'it took too long'}"
         if "problem" in answer:
@@ -79,15 +82,20 @@ class Cores:
         for path in self._folder.glob(f"*{SUFFIX}"):
             with contextlib.suppress(OSError):
                 found.append((path.stat().st_mtime, path.stat().st_size, path))
-        total = of_it = 0
+        # Where they are, others may have files to write: usually it is /run.
+        room = min(KEPT_BYTES, (sum(size for _, size, _ in found) + _free_bytes(self._folder)) // 2)
+        total = count = its_bytes = 0
         for at, size, path in sorted(found, reverse=True):
             total += size
-            of_it += path.name.rsplit(".", 3)[0] == name
-            too_many = total > KEPT_BYTES or (of_it > KEPT_OF_EACH and path.name.rsplit(".", 3)[0] == name)
+            is_its = path.name.rsplit(".", 3)[0] == name
+            count += is_its
+            its_bytes += is_its * size
+            too_many = total > room or (is_its and (count > KEPT_OF_EACH or its_bytes > room // 2))
             if path != newest and (too_many or time.time() - at > KEPT_S):
                 with contextlib.suppress(OSError):
                     path.unlink()
                 total -= size
+                its_bytes -= is_its * size
 
 
 def _request(case: Case, path: Path, mode: str, seconds_max: float, command: str) -> Request:
@@ -129,6 +137,11 @@ async def _written(request: Request, within_s: float) -> dict[str, Any]:
     if not isinstance(answer, dict):
         raise ValueError("invalid answer from its writer")
     return answer
+
+
+def _free_bytes(folder: Path) -> int:
+    status = os.statvfs(folder)
+    return status.f_bavail * status.f_frsize
 
 
 def _is_cramped(pid: int) -> bool:
