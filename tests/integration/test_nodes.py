@@ -20,9 +20,9 @@ import psutil
 import pytest
 from avckpt.artifacts import init_binary
 
-from testkit.harness import avckpt_command, run, wait_until
+from testkit.harness import ROOT, avckpt_command, run, wait_until
 from testkit.local_sidecar import LocalSidecar
-from testkit.procfs import children_of, inside
+from testkit.procfs import children_of, comm_of, inside
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
 SHARED = pytest.mark.shared_machine(
@@ -239,14 +239,16 @@ def send(connection, said, *fds):
         os.close(fd)
 
 theirs, how = [], sys.argv[1]
+open("/proc/self/comm", "w").write("stranger")  # whom the file server answers
 if how != "ends":
     print("stop it", flush=True)
     sys.stdin.readline()
+    sent = (lambda: os.open(sys.argv[3], os.O_RDONLY)) if how == "served" else lingering
     others = [connect() for _ in range(16 if how == "unread" else 0)]
     connection = connect()
     if how == "behind":
         connection.send(b"nonsense")
-    send(connection, b"avckpt-unit 1\\0name=a\\0", *(lingering() for _ in range(6 if how == "many" else 1)))
+    send(connection, b"avckpt-unit 1\\0name=a\\0", *(sent() for _ in range(6 if how == "many" else 1)))
 else:
     connection = connect()
     send(connection, b"avckpt-unit 1\\0name=a\\0label=avckpt.interval=1h\\0", os.pidfd_open(os.getpid()))
@@ -260,12 +262,30 @@ sys.stdin.readline()
 
 
 @SHARED
-@pytest.mark.parametrize("how", ["claims", "many", "behind", "unread", "ends"])
-def test_nobody_waits_for_what_strangers_send(local: LocalSidecar, how: str) -> None:
+@pytest.mark.parametrize("how", ["claims", "many", "behind", "unread", "ends", "served"])
+def test_nobody_waits_for_what_strangers_send(local: LocalSidecar, tmp_path: Path, how: str) -> None:
+    with contextlib.ExitStack() as served:
+        if how == "served":
+            subprocess.run(["make", "-s", "-C", str(ROOT / "tests/victims")], check=True)
+            daemon = comm_of(local.client.info()["pid"])
+            command = [str(ROOT / "tests/victims/build/server"), str(tmp_path), daemon]
+            server = served.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE))
+            assert server.stdout is not None
+            if server.stdout.readline() != b"ready\n":
+                pytest.skip("/dev/fuse is not available here")
+            served.callback(run, ["umount", "-l", str(tmp_path / "mount")])
+            served.callback(server.kill)
+        be_a_stranger(local, how, tmp_path / "mount" / "served")
+
+
+def be_a_stranger(local: LocalSidecar, how: str, file: Path) -> None:
     path = local.run_dir / "units" / "units.sock"
     daemon = local.client.info()["pid"]
     with subprocess.Popen(
-        [sys.executable, "-c", LINGERING, how, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", LINGERING, how, str(path), str(file)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     ) as stranger:
         assert stranger.stdin is not None
         assert stranger.stdout is not None

@@ -24,6 +24,7 @@ from avckpt.budget import CpuBudget
 from avckpt.cli.run import Job, Supervisor, memory_limit_bytes, say
 from avckpt.containers import units
 from avckpt.containers.process import has_ended, pid_of, status
+from avckpt.containers.strangers import let_go, receive
 from avckpt.engine import Engine, Guard
 from avckpt.errors import AvckptError, Busy, Denied
 from avckpt.events.journal import Journal
@@ -91,7 +92,7 @@ class NodesSupervisor(Supervisor):
                     elif key.fileobj is self._listening:
                         self._accept()
                     elif isinstance(key.fileobj, socket.socket):
-                        self._serve(key.fileobj)
+                        self._serve(key.fileobj, key.data)
                     elif key.data is not None:
                         self._end(key.data)
                 if not self._ready and self._takes_signals():
@@ -114,15 +115,25 @@ class NodesSupervisor(Supervisor):
             connection, _ = self._listening.accept()
             connection.setblocking(False)
             if sum(isinstance(key.fileobj, socket.socket) for key in self._selector.get_map().values()) > 64:
-                connection.close()
+                let_go(connection.detach())
             else:
                 self._selector.register(connection, selectors.EVENT_READ)
 
-    def _serve(self, connection: socket.socket) -> None:
+    def _serve(self, readable: socket.socket, connection: socket.socket | None) -> None:
+        """There is a request; or it has been read, of that connection."""
+        if connection is None:
+            self._selector.unregister(readable)
+            try:
+                self._selector.register(receive(readable, units.UNIT_BYTES), selectors.EVENT_READ, readable)
+            except (OSError, RuntimeError):  # too many files or threads: it tries again
+                let_go(readable.detach())
+            return
         with contextlib.suppress(BlockingIOError):
-            refused = units.serve(connection, self._register)
-            self._selector.unregister(connection)
+            refused = units.serve(connection, readable, self._register)
+            self._selector.unregister(readable)
+            readable.close()
             if refused is not None:
+                let_go(connection.detach())
                 say(f"refused a unit: {refused.partition(' ')[2]}")
 
     def _register(self, claim: units.Claim, peer: units.Peer) -> None:
@@ -152,7 +163,7 @@ class NodesSupervisor(Supervisor):
         self._take_events(self._engine)
         del self._nodes[cookie]
         os.close(node.peer.pidfd)
-        node.peer.connection.close()
+        let_go(node.peer.connection.detach())
 
     def _take_events(self, engine: Engine) -> None:
         while (event := engine.next_event()) is not None:

@@ -112,7 +112,7 @@ def has_ended(pidfd: int) -> bool:
 
 def is_pidfd(fd: int) -> bool:
     """Whether a descriptor is a pidfd.  Asks nothing of the file itself."""
-    return os.readlink(f"/proc/self/fd/{fd}") == "anon_inode:[pidfd]"
+    return os.readlink(f"/proc/thread-self/fd/{fd}") == "anon_inode:[pidfd]"
 
 
 def is_foreign(pidfd: int) -> bool:

@@ -23,11 +23,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from avckpt_hooks.shared.labels import LABELS, SHM_MAX_BYTES, LabelError, parse_policy
-from avckpt_hooks.shared.protocol import ProtocolError, received_fds
+from avckpt_hooks.shared.protocol import ProtocolError
 
 from avckpt.bucket import Bucket
-from avckpt.containers.process import has_ended, is_foreign, is_pidfd, pid_of, start_time, status
-from avckpt.containers.strangers import let_go
+from avckpt.containers.process import has_ended, is_foreign, pid_of, start_time, status
+from avckpt.containers.strangers import let_go, receive, received
 from avckpt.errors import AvckptError, Busy, Denied, LabelsWrong, TargetGone, of_any
 
 log = logging.getLogger("avckpt")
@@ -36,8 +36,6 @@ UNIT_BYTES = 16384
 """Longest packet; PACKET_MAX of native/init/unit.c."""
 GREETING = b"avckpt-unit 1"
 FIELDS_MOST = 64
-SCM_MAX_FD = 253
-"""Descriptors in one packet, include/net/scm.h."""
 BACKLOG = 64
 MAX_WAITING = 16
 """Connections of one party that have not sent their request yet."""
@@ -170,9 +168,7 @@ def unique_name(name: str, taken: Iterable[str]) -> str:
 
 
 def check_sender(pidfd: int, pid: int) -> None:
-    """Whether a descriptor is a pidfd of the process that has connected.  Raises AvckptError."""
-    if not is_pidfd(pidfd):  # which others may have to be asked for whether they are readable
-        raise Denied("its descriptor is not one of a process")
+    """Whether a pidfd is of the process that has connected.  Raises AvckptError."""
     if has_ended(pidfd):
         raise TargetGone("it has ended already")
     if is_foreign(pidfd):
@@ -281,6 +277,8 @@ class UnitListener:
         self._refusals = Bucket(REFUSALS_TOLD, 1 / REFUSAL_S)
         self._untold = 0
         self._leaving: list[socket.socket] = []
+        self._reading: dict[socket.socket, socket.socket] = {}
+        """By connection: where what it said will be."""
         self._socket = listen(path)
         self._loop.add_reader(self._socket, self._accept)
 
@@ -316,7 +314,7 @@ class UnitListener:
             return
         timer = self._loop.call_later(WAIT_S, self._drop, connection)
         self._waiting[connection] = timer, party
-        self._loop.add_reader(connection, self._serve, connection)
+        self._loop.add_reader(connection, self._read, connection)
 
     def _party(self, space: int, uid: int) -> int:
         """Who shares what room there is.  Nobody is to get more by making namespaces, or changing its user."""
@@ -335,9 +333,19 @@ class UnitListener:
         if self._socket.fileno() >= 0:
             self._loop.add_reader(self._socket, self._accept)
 
-    def _serve(self, connection: socket.socket) -> None:
+    def _read(self, connection: socket.socket) -> None:
+        self._loop.remove_reader(connection)
         try:
-            answer = serve(connection, self._handler)
+            said = self._reading[connection] = receive(connection, UNIT_BYTES)
+        except (OSError, RuntimeError) as error:
+            log.error("a unit cannot be heard: %s", error)
+            self._drop(connection)
+        else:
+            self._loop.add_reader(said, self._serve, connection, said)
+
+    def _serve(self, connection: socket.socket, said: socket.socket) -> None:
+        try:
+            answer = serve(connection, said, self._handler)
         except BlockingIOError:
             return  # not readable after all
         if answer is None:
@@ -375,6 +383,10 @@ class UnitListener:
         if waiting is not None:
             waiting[0].cancel()
             self._loop.remove_reader(connection)
+        said = self._reading.pop(connection, None)
+        if said is not None:
+            self._loop.remove_reader(said)
+            said.close()
 
 
 def listen(path: Path) -> socket.socket:
@@ -399,46 +411,42 @@ def credentials(connection: socket.socket) -> tuple[int, int]:
     return pid, uid
 
 
-def serve(connection: socket.socket, handler: Handler) -> str | None:
-    """Reads a unit's request, and answers. The refusal, or None: then the connection is the handler's.
+def serve(connection: socket.socket, said: socket.socket, handler: Handler) -> str | None:
+    """Takes a unit's request, which `receive()` has read, and answers. The refusal, or None: then the connection is
+    the handler's.
 
     The caller hangs up on who was refused.  Raises BlockingIOError when there is no request yet.
     """
     name = "a unit"
     fds: list[int] = []
     try:
-        claim, fds = _receive(connection)
+        request = received(said, UNIT_BYTES)
+        if request is None:
+            raise Busy("what it said cannot be read")
+        packet, came, fds = request
+        if len(packet) > UNIT_BYTES:
+            raise ProtocolError("its message is too long")
+        claim = decode_claim(packet)
         name = claim.name
         pid, uid = credentials(connection)
         name = f"{claim.name} (pid {pid})"
-        if len(fds) != 1:
-            raise ProtocolError(f"one descriptor wanted, {len(fds)} came")
+        if came != 1:
+            raise ProtocolError(f"one descriptor wanted, {came} came")
+        if not fds:
+            raise Denied("its descriptor is not one of a process")
         check_sender(fds[0], pid)
         handler(claim, Peer(connection, fds[0], pid, uid))
     except BlockingIOError:
         raise
     except (ProtocolError, AvckptError, OSError) as error:
+        for fd in fds:
+            os.close(fd)
         word = "later" if isinstance(error, (Busy, OSError)) else "no"
         why = str(error) if isinstance(error, (ProtocolError, AvckptError)) else str(of_any(error))
         _say(connection, f"{word} {why}")
-        let_go(*fds)
         return f"{word} {name}: {why}"
     _say(connection, "ok")
     return None
-
-
-def _receive(connection: socket.socket) -> tuple[Claim, list[int]]:
-    # What does not fit, the kernel closes at once, and would have us wait for that.
-    room = socket.CMSG_SPACE(SCM_MAX_FD * struct.calcsize("i"))
-    packet, ancillary, flags, _ = connection.recvmsg(UNIT_BYTES, room, socket.MSG_CMSG_CLOEXEC)
-    fds = received_fds(ancillary)
-    try:
-        if flags & socket.MSG_TRUNC:
-            raise ProtocolError("its message is too long")
-        return decode_claim(packet), fds
-    except ProtocolError:
-        let_go(*fds)
-        raise
 
 
 def _say(connection: socket.socket, text: str) -> None:
