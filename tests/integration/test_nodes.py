@@ -183,7 +183,7 @@ def test_requests_of_anybody_fill_no_log(local: LocalSidecar, start: Any) -> Non
 
 
 HOG = """
-import os, select, socket, sys
+import os, select, socket, sys, time
 poller, held = select.poll(), {}
 while True:
     while len(held) < 20:
@@ -194,6 +194,7 @@ while True:
     for fd, _ in poller.poll():
         poller.unregister(fd)
         held.pop(fd).close()
+    time.sleep(0.01)
 """
 
 
