@@ -23,10 +23,22 @@ from avckpt.containers.process import is_pidfd
 
 CLONE_FILES = 0x400
 """linux/sched.h"""
+WAITING_MOST = 32
+"""Threads that wait for somebody: then `is_busy()`."""
 SCM_MAX_FD = 253
 """Descriptors in one packet, include/net/scm.h: what there is no room for, the kernel closes at once."""
 
 _libc = ctypes.CDLL(None, use_errno=True)
+_threads: set[int] = set()
+"""By number; some of them have ended."""
+
+
+def is_busy() -> bool:
+    """Whether so many things of strangers are waited for that nothing more is to be taken from anybody for now."""
+    for tid in list(_threads):
+        if not os.path.exists(f"/proc/self/task/{tid}"):
+            _threads.discard(tid)
+    return len(_threads) >= WAITING_MOST
 
 
 def let_go(*fds: int) -> None:
@@ -89,6 +101,7 @@ def _apart(keep: tuple[int, ...], work: Callable[[], object]) -> None:
     copied = threading.Event()
 
     def run() -> None:
+        _threads.add(threading.get_native_id())
         has_table = _libc.unshare(CLONE_FILES) == 0
         copied.set()
         if not has_table:

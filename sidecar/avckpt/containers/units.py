@@ -27,7 +27,7 @@ from avckpt_hooks.shared.protocol import ProtocolError
 
 from avckpt.bucket import Bucket
 from avckpt.containers.process import has_ended, is_foreign, pid_of, start_time, status
-from avckpt.containers.strangers import let_go, receive, received
+from avckpt.containers.strangers import is_busy, let_go, receive, received
 from avckpt.errors import AvckptError, Busy, Denied, LabelsWrong, TargetGone, of_any
 
 log = logging.getLogger("avckpt")
@@ -50,6 +50,8 @@ CONNECTIONS_PER_S = 16.0
 """... and further ones; the rest are closed unread."""
 LEAVE_S = 0.02
 """Then what was hung up meanwhile is closed."""
+BUSY_S = 0.1
+"""While things of strangers are waited for."""
 PARTIES_MOST = 256
 """Remembered."""
 OTHERS = 0
@@ -292,6 +294,10 @@ class UnitListener:
         self._path.unlink(missing_ok=True)
 
     def _accept(self) -> None:
+        if is_busy():
+            self._loop.remove_reader(self._socket)
+            self._loop.call_later(BUSY_S, self._accept_again)
+            return
         try:
             connection, _ = self._socket.accept()
         except (BlockingIOError, ConnectionAbortedError):
