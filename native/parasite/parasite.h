@@ -97,12 +97,18 @@ struct inj_control {
 	uint64_t magic;       /* INJ_MAGIC once the parasite is complete             */
 	uint64_t nonce;       /* of the guard that made it                      */
 	uint32_t arrived;     /* 1: who goes home by itself needs `home` no more        */
+	/* Where calls that were cut short return to, from the same place in the code; once set, it
+	 * stays.  0: not used yet. */
+	uint64_t cut[INJ_CUT_PLACES];
 	struct inj_call runner __attribute__((aligned(64))); /* a live thread of the app */
 	struct inj_call holder __attribute__((aligned(64)));
 	/* What is left of the app's timers (timers.c). */
 	struct inj_timer timer[INJ_TIMERS_MAX];
 };
 _Static_assert(offsetof(struct inj_control, arrived) == HOME_ARRIVED, "parasite.S");
+#ifdef HOME_CUT
+_Static_assert(offsetof(struct inj_control, cut) == HOME_CUT, "parasite.S");
+#endif
 _Static_assert(sizeof(struct inj_control) <= INJ_SLOTS_OFFSET - INJ_CODE_BYTES, "control area");
 
 /* A call that a process makes while it is restored: one of a list. Lists are made once, with the

@@ -11,10 +11,13 @@
  *   kill-sigprocmask, kill-sigreturn: kill the process that calls it
  *   killing        kills a process that makes the call by which the kernel continues a sleep,
  *                  restart_syscall(2), which few programs know of
+ *   exacting       kills a process that calls write, sendto or recvfrom with a first argument of more
+ *                  than 32 bits
  */
 #include <errno.h>
 #include <linux/filter.h>
 #include <linux/seccomp.h>
+#include <stdbool.h>
 #include <stddef.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -45,6 +48,7 @@ static const struct kind {
 	{ "kill-sigprocmask", SECCOMP_RET_KILL_PROCESS, { SYS_rt_sigprocmask } },
 	{ "kill-sigreturn", SECCOMP_RET_KILL_PROCESS, { SYS_rt_sigreturn } },
 	{ "killing", SECCOMP_RET_KILL_PROCESS, { SYS_restart_syscall } },
+	{ "exacting", SECCOMP_RET_KILL_PROCESS, { SYS_write, SYS_sendto, SYS_recvfrom } },
 };
 
 static const struct kind *find(const char *name)
@@ -57,14 +61,21 @@ static const struct kind *find(const char *name)
 
 static int come_under(const struct kind *kind)
 {
-	struct sock_filter filter[2 * CALLS_MAX + 2], *end = filter;
+	struct sock_filter filter[4 * CALLS_MAX + 2], *end = filter;
+	const bool exacting = !strcmp(kind->name, "exacting");
 	struct sock_fprog program = { .filter = filter };
 
 	*end++ = (struct sock_filter)BPF_STMT(BPF_LD | BPF_W | BPF_ABS,
 					      offsetof(struct seccomp_data, nr));
 	for (int i = 0; i < CALLS_MAX && kind->call[i]; i++) {
 		*end++ = (struct sock_filter)BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, kind->call[i], 0,
-						      1);
+						      exacting ? 4 : 1);
+		if (exacting) {
+			*end++ = (struct sock_filter)BPF_STMT(
+				BPF_LD | BPF_W | BPF_ABS, offsetof(struct seccomp_data, args) + 4);
+			*end++ = (struct sock_filter)BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, 0, 0, 1);
+			*end++ = (struct sock_filter)BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW);
+		}
 		*end++ = (struct sock_filter)BPF_STMT(BPF_RET | BPF_K, kind->action);
 	}
 	*end++ = (struct sock_filter)BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW);

@@ -49,6 +49,10 @@ long arch_syscall_nr_before(const uint8_t code[ARCH_CODE_BYTES]);
 /* Whether `code` is a system call instruction. */
 bool arch_is_syscall(const uint8_t code[ARCH_SYSCALL_BYTES]);
 
+/* A call that has done a part, which is its result: the rest of it is to be made at `place` (inj_cut()),
+ * where the kernel restarts it. */
+void arch_call_rest(struct arch_regs *regs, avc_remote place);
+
 /* Like arch_rewind(), for the *same* task continuing without the kernel's help: its restart block
  * is still there and is continued, not restarted. */
 void arch_resume(struct arch_regs *regs);

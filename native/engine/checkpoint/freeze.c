@@ -412,19 +412,10 @@ static void let_go(struct freeze *freeze)
 		if (freeze->generation->image[0].template && main_thread->borrowed)
 			(void)freeze_park_main(main, main_thread,
 					       &ignored); /* or it is killed just now */
-		thread_let_go_uncut(main, main_thread);
+		thread_let_go(main, main_thread);
 	}
 	for (uint32_t i = 0; i < freeze->tree->processes; i++)
 		process_let_go(freeze->tree->process[i]);
-}
-
-/* Everything else runs again: their readers, too. */
-static void finish_writes(struct freeze *freeze)
-{
-	const uint64_t end = writes_end();
-
-	for (uint32_t i = 0; i < freeze->tree->processes; i++)
-		writes_finish_until(freeze->tree->process[i], end);
 }
 
 int freeze_tree(struct freeze *freeze, struct avc_error *err)
@@ -454,7 +445,6 @@ int freeze_tree(struct freeze *freeze, struct avc_error *err)
 	freeze->freeze_ns = now_ns() - start;
 	tracee_deadline_clear(freeze->timer);
 	rt_priority_end();
-	finish_writes(freeze);
 	if (result)
 		return -1;
 	for (uint32_t i = 0; i < generation->images; i++)

@@ -209,7 +209,7 @@ static int returns_to_old(const struct process *process, const struct thread *t,
 {
 	(void)t;
 	(void)surely;
-	return parasite_is_old(process, frame->pc);
+	return parasite_is_needed(process, frame->pc);
 }
 
 static int returns_to_parasite(const struct process *process, const struct thread *t,
@@ -233,6 +233,10 @@ static bool any_returns(const struct process *process, frame_test *fits)
 
 bool process_needs_old(const struct process *process)
 {
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		if (process->threads[i].stopped &&
+		    parasite_is_needed(process, arch_pc(&process->threads[i].regs)))
+			return true;
 	return any_returns(process, returns_to_old);
 }
 

@@ -674,10 +674,9 @@ int process_infect(struct process *process, uint32_t slots, timer_t timer, uint6
 		thread = stop_main(process, err);
 	result = thread ? infect_thread(process, thread, slots, err) : -1;
 	if (thread)
-		thread_let_go_uncut(process, thread);
+		thread_let_go(process, thread);
 	tracee_deadline_clear(timer);
 	rt_priority_end();
-	writes_finish(process);
 	return result;
 }
 

@@ -10,7 +10,6 @@
  *   watcher.c       ... where its container may not watch memory
  *   support.c       what cannot be protected; quiescence
  *   waits.c         ends calls whose timeout has expired
- *   writes.c        goes on with a write that a stop has cut short
  *   dying.c         in its own handler of a fatal signal
  *   fence.c         ... or in a Landlock domain of its own
  *   tree.c          all of them
@@ -142,7 +141,6 @@ void process_stop_begin(struct process *process);
 bool process_interrupt(struct process *process, bool real_time);
 int process_await(struct process *process, struct avc_error *err) warn_unused;
 int process_stop_all(struct process *process, struct avc_error *err) warn_unused;
-/* All but those whose write is cut short: writes_finish() is for them. */
 void process_let_go(struct process *process);
 /* Ends a stop of the whole process that began with rt_priority_begin() and tracee_deadline_set(): all run
  * again. */
@@ -279,17 +277,5 @@ void tree_free(struct tree *tree);
 void waits_prepare(struct process *process);
 /* Ends rewound calls whose time is up; the next is due at process->due_ns (UINT64_MAX: none). */
 void waits_end(struct process *process, timer_t timer);
-
-/* ---- writes.c ---------------------------------------------------------------------- */
-
-/* Unless it has been stopped in a write(2) and has not written everything: that is for
- * writes_finish(). */
-void thread_let_go_uncut(struct process *process, struct thread *thread);
-/* After process_let_go(): releases these threads as well; before that, writes the rest if it was into a
- * pipe.  Everything else runs, those that read, too; takes a second at most. */
-void writes_finish(struct process *process);
-/* The same for several, all of them until writes_end(). */
-void writes_finish_until(struct process *process, uint64_t end);
-uint64_t writes_end(void);
 
 #endif

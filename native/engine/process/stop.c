@@ -169,9 +169,9 @@ void process_let_go(struct process *process)
 	process->filters_seen = false; /* they may have got some while they were being stopped */
 	for (uint32_t i = 0; i < process->thread_count; i++)
 		if (is_real_time(&process->threads[i]))
-			thread_let_go_uncut(process, &process->threads[i]);
+			thread_let_go(process, &process->threads[i]);
 	for (uint32_t i = 0; i < process->thread_count; i++)
-		thread_let_go_uncut(process, &process->threads[i]);
+		thread_let_go(process, &process->threads[i]);
 }
 
 void process_go_on(struct process *process, timer_t timer)
@@ -179,5 +179,4 @@ void process_go_on(struct process *process, timer_t timer)
 	process_let_go(process);
 	tracee_deadline_clear(timer);
 	rt_priority_end();
-	writes_finish(process);
 }

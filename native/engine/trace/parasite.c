@@ -128,7 +128,7 @@ avc_remote parasite_remote(const struct parasite *parasite, const void *local)
 bool parasite_contains(const struct parasite *parasite, avc_remote address)
 {
 	return parasite->base && address >= parasite->base &&
-	       address < parasite->base + parasite->bytes;
+	       address < parasite->base + parasite->bytes && !cut_contains(parasite->base, address);
 }
 
 uint8_t *parasite_setup(const struct parasite *parasite, uint32_t slot)
@@ -395,6 +395,11 @@ int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*mean
 }
 
 bool parasite_is_old(const struct process *process, avc_remote address)
+{
+	return parasite_is_needed(process, address) && !cut_is_place(process, address);
+}
+
+bool parasite_is_needed(const struct process *process, avc_remote address)
 {
 	for (uint32_t i = 0; i < process->old_parasites; i++)
 		if (address - process->old_parasite[i].base < process->old_parasite[i].bytes)

@@ -465,6 +465,7 @@ void rewind_call(struct process *process, struct thread *thread)
 		return;
 	if (arch_syscall_nr(regs) == SYS_recvmmsg)
 		forget_error(process, regs);
+	cut_go_on(process, thread);
 	if (is_not_restarted(process, thread)) {
 		if (!is_rewound(thread))
 			begin_watch(process, thread, now);

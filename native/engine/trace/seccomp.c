@@ -420,21 +420,25 @@ static bool hinders_trees(const struct program *p)
 }
 
 /* Where the kernel would continue an interrupted call. */
-static bool bars_restart(const struct program *p)
-{
-	return verdict(p, SYS_restart_syscall, ANY) != PASSES;
-}
+static const struct kind restarts[] = { { SYS_restart_syscall, ANY } };
+/* ... and we (cut.c): with another first argument, and from elsewhere. */
+static const struct kind rests[] = {
+	{ SYS_write, ANY },
+	{ SYS_sendto, ANY },
+	{ SYS_recvfrom, ANY },
+};
 
 /* The container's filters, as of the first thread that was looked at. */
 static struct {
-	bool known, hinder, refuse_watching, refuse_asking, bar_restart;
+	bool known, hinder, refuse_watching, refuse_asking, bar_restart, bar_rest;
 } containers_filters;
 
 static void note_containers(const struct program *p, bool barred)
 {
 	containers_filters.hinder |= refuses_any(p, needed, COUNT(needed)) || barred;
 	containers_filters.refuse_asking |= refuses_any(p, needed_to_ask, COUNT(needed_to_ask));
-	containers_filters.bar_restart |= bars_restart(p);
+	containers_filters.bar_restart |= refuses_any(p, restarts, COUNT(restarts));
+	containers_filters.bar_rest |= refuses_any(p, rests, COUNT(rests));
 	containers_filters.refuse_watching |= verdict(p, needed_to_watch.nr, needed_to_watch.arg) !=
 					      PASSES;
 }
@@ -607,18 +611,28 @@ static bool has_own(struct process *process)
 	return process->filters_own;
 }
 
-bool seccomp_bars_restart(struct process *process, pid_t tid)
+static bool own_refuse(struct process *process, pid_t tid, const struct kind *kinds, size_t count)
 {
 	struct program p;
 
-	if (containers_filters.bar_restart)
-		return true;
 	if (confined.is)
 		return has_own(process);
 	for (uint32_t i = process->plain_filters; (p.count = filter_get(tid, i, p.insn)) > 0; i++)
-		if (bars_restart(&p))
+		if (refuses_any(&p, kinds, count))
 			return true;
 	return errno == EMEDIUMTYPE; /* it cannot be read */
+}
+
+bool seccomp_bars_restart(struct process *process, pid_t tid)
+{
+	return containers_filters.bar_restart ||
+	       own_refuse(process, tid, restarts, COUNT(restarts));
+}
+
+bool seccomp_bars_rest(struct process *process, pid_t tid)
+{
+	return !containers_filters.known || containers_filters.bar_rest ||
+	       own_refuse(process, tid, rests, COUNT(rests));
 }
 
 /* ---- supervision ---------------------------------------------------------------------------- */

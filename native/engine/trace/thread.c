@@ -271,6 +271,7 @@ void thread_release(struct process *process, struct thread *thread)
 	/* Otherwise it is elsewhere by now. */
 	if (!thread->borrowed || thread_give_back(thread, &ignored) == 0)
 		rewind_continued(process, thread);
+	cut_go_on(process, thread); /* there may have been no parasite when it was stopped */
 	end_call_by_signal(process, thread);
 	/* If this fails, SIGKILL has ended its stop: it has to be reaped. */
 	thread->attached = ptrace(PTRACE_DETACH, thread->tid, NULL, 0L) != 0;

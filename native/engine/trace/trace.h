@@ -5,6 +5,7 @@
  *   tracee.c        seize, stop, wait, release
  *   thread.c        a thread of the app: stopped, released
  *   rewind.c        interrupted system calls
+ *   cut.c           ... that have done a part
  *   parasite.c      the parasite as the engine sees it, code run in a process
  *   seccomp.c       ... despite the app's seccomp filters
  *   setup.c         lists of calls that a restored process makes
@@ -411,6 +412,15 @@ void thread_fix_rseq(int mem_fd, struct thread *thread);
 /* Whether a stopped thread can run injected code. */
 int thread_check_dispatch(pid_t tid, struct avc_error *err) warn_unused;
 
+/* ---- cut.c ------------------------------------------------------------------------ */
+
+/* If the call of a stopped thread has been cut short, sets the thread to go on with the rest. */
+void cut_go_on(struct process *process, struct thread *thread);
+/* Whether that is where, in the parasite at this address: the thread is in a call of its own. */
+bool cut_contains(avc_remote parasite, avc_remote address);
+/* ... in the parasite of this process, or in one that a dead guard has left. */
+bool cut_is_place(const struct process *process, avc_remote address);
+
 /* ---- rewind.c --------------------------------------------------------------------- */
 
 /* A thread that just stopped: notes which call it is in.  If only we have interrupted that, sets
@@ -454,6 +464,8 @@ bool seccomp_must_suspend(void);
 bool seccomp_is_containers(const struct proc_status *status, uint32_t containers);
 /* Whether a filter of this (stopped) thread prevents restart_syscall(2). */
 bool seccomp_bars_restart(struct process *process, pid_t tid);
+/* Whether one looks at more than the number of a call that was cut short (cut.c). */
+bool seccomp_bars_rest(struct process *process, pid_t tid);
 /* From now on, until seccomp_end_supervision(): `options` are its other ptrace options, `inside` is
  * the PID of its process in its own namespace, `code` and `bytes` are where injected code is. */
 int seccomp_supervise(pid_t tid, pid_t inside, long options, avc_remote code,
@@ -479,6 +491,7 @@ size_t parasite_layout(struct parasite *parasite, uint32_t slots, uint32_t threa
 void parasite_close(struct parasite *parasite);
 struct inj_slot *parasite_slot(const struct parasite *parasite, uint32_t slot);
 avc_remote parasite_remote(const struct parasite *parasite, const void *local);
+/* But not where calls of the app's go on (cut.c). */
 bool parasite_contains(const struct parasite *parasite, avc_remote address);
 /* Block of thread `i` in a slot, its signal frame, the top of its stack. */
 struct inj_thread *parasite_thread(const struct parasite *parasite, uint32_t slot, uint32_t i);
@@ -525,8 +538,11 @@ int parasite_set_undo(struct process *process, long nr, const uint64_t arg[6]) w
 void parasite_clear_undo(struct process *process);
 /* Whether the thread that has left it by itself says that it is home. */
 bool parasite_says_home(const struct parasite *parasite);
-/* Whether this is in a parasite left behind by a dead guard, or in a stub that stays. */
+/* Whether this is in a parasite left behind by a dead guard, or in a stub that stays; not where calls of
+ * the app's go on. */
 bool parasite_is_old(const struct process *process, avc_remote address);
+/* The same, there as well. */
+bool parasite_is_needed(const struct process *process, avc_remote address);
 /* Options for a stopped task of ours, which has the memory of the parasite's process. */
 int parasite_own(const struct parasite *parasite, pid_t tid) warn_unused;
 /* May this stopped thread be borrowed?  As far as that is to be read in its memory. */

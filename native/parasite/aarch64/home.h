@@ -11,6 +11,11 @@
 #define HOME_SVE_VL 1128
 #define HOME_ARRIVED 1152 /* struct inj_control */
 
+/* No call goes on here (ARCH_FORGETS_CALLS). */
+#define INJ_CUT_OFFSET 8192
+#define INJ_CUT_PLACES 1
+#define INJ_CUT_BYTES 8
+
 #ifndef __ASSEMBLER__
 #include <stddef.h>
 #include <stdint.h>

@@ -140,4 +140,7 @@ inj_sigreturn:
 	svc	#0
 	brk	#0
 
+	.globl	inj_cut_at
+	.set	inj_cut_at, INJ_CUT_OFFSET
+
 	.section .note.GNU-stack,"",@progbits

@@ -11,6 +11,13 @@
 #define HOME_DIRECTION 140
 #define HOME_RIP 144
 #define HOME_ARRIVED 168 /* struct inj_control */
+#define HOME_CUT 176     /* likewise */
+
+/* Where calls go on that were cut short (inj_cut()), in every version of the code: a guard has to
+ * recognize those of an earlier one. */
+#define INJ_CUT_OFFSET (8192 - INJ_CUT_PLACES * INJ_CUT_BYTES)
+#define INJ_CUT_PLACES 24
+#define INJ_CUT_BYTES 72 /* of each */
 
 #ifndef __ASSEMBLER__
 #include <stddef.h>

@@ -4,6 +4,7 @@
  */
 #include "home.h"
 
+#define ENOTSOCK 88
 #define NR_RT_SIGPROCMASK 14
 #define NR_RT_SIGRETURN 15
 #define NR_CLONE 56
@@ -148,5 +149,52 @@ inj_sigreturn:
 	movl	$NR_RT_SIGRETURN, %eax
 	syscall
 	ud2
+
+/* Where a call that a stop has cut short goes on (engine/trace/cut.c): a place for each instruction of
+ * the app's that makes such calls, to which it returns.  The call comes with its first argument's
+ * upper half, of which the kernel takes no notice, saying how much was done before; with the address
+ * and the size of what is left; and with nothing else changed.  So all there is to know is in
+ * registers, and may be interrupted and copied like the app's own.
+ *
+ * A call that has done a part does not tell of an error but returns the part.  The next one tells,
+ * but for errors that a socket tells only once (their numbers begin at ENOTSOCK): these are told now.
+ *
+ * A system call preserves flags, too, and leaves the address after it in rcx: that alone is free here. */
+	.globl	inj_cut_at
+	.set	inj_cut_at, INJ_CUT_OFFSET
+	.section .text.cut,"ax",@progbits
+	.globl	inj_cut
+	.type	inj_cut, @function
+inj_cut:
+	.set	place, 0
+	.rept	INJ_CUT_PLACES
+	syscall
+	bswapq	%rdi
+	movl	%edi, %ecx
+	bswapl	%ecx				/* how much was done before */
+	leaq	(%rdx,%rcx), %rdx
+	notq	%rcx
+	leaq	1(%rsi,%rcx), %rsi
+	movq	%rax, %rcx
+	bswapq	%rcx
+	movl	%ecx, %ecx
+	jrcxz	2f				/* no error */
+	leaq	ENOTSOCK-1(%rax), %rcx
+	bswapq	%rcx
+	movl	%ecx, %ecx
+	jrcxz	1f
+	jmp	3f
+1:	movl	$0, %eax
+2:	movl	%edi, %ecx
+	bswapl	%ecx
+	leaq	(%rax,%rcx), %rax
+3:	bswapq	%rdi
+	movl	%edi, %edi
+	movq	home+HOME_CUT+8*place(%rip), %rcx
+	jmp	*%rcx
+	.balign	8
+	.set	place, place+1
+	.endr
+	.org	inj_cut + INJ_CUT_PLACES * INJ_CUT_BYTES
 
 	.section .note.GNU-stack,"",@progbits

@@ -220,6 +220,11 @@ void arch_rewind(struct arch_regs *regs)
 	regs->nr = -1;
 }
 
+void arch_call_rest(struct arch_regs *regs, avc_remote place)
+{
+	(void)regs, (void)place;
+}
+
 void arch_resume(struct arch_regs *regs)
 {
 	if (regs->nr >= 0 && regs->result == -ERESTART_RESTARTBLOCK)

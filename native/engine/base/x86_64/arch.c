@@ -91,6 +91,19 @@ void arch_rewind(struct arch_regs *regs)
 	regs->r.orig_rax = -1ULL;
 }
 
+/* If a signal with a handler is pending, the result becomes EINTR, and the call returns its part. */
+void arch_call_rest(struct arch_regs *regs, avc_remote place)
+{
+	const uint64_t part = regs->r.rax;
+
+	regs->r.rdi += part << 32;
+	regs->r.rsi += part;
+	regs->r.rdx -= part;
+	regs->r.rip = place + ARCH_SYSCALL_BYTES;
+	regs->r.rax = (unsigned long long)-ERESTARTNOHAND;
+	regs->r.orig_rax = (uint32_t)regs->r.orig_rax;
+}
+
 void arch_resume(struct arch_regs *regs)
 {
 	if (arch_syscall_nr(regs) >= 0 && arch_syscall_result(regs) == -ERESTART_RESTARTBLOCK) {

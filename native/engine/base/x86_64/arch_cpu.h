@@ -52,6 +52,12 @@ static inline void arch_result_note(struct arch_regs *regs, long result)
 	regs->r.rax = (unsigned long long)result;
 }
 uint64_t arch_syscall_arg(const struct arch_regs *regs, unsigned int n);
+/* Of a call whose first argument is a descriptor, an int: how much it had done before it was made again
+ * (inj_cut()). */
+static inline uint32_t arch_call_done(const struct arch_regs *regs)
+{
+	return (uint32_t)(regs->r.rdi >> 32);
+}
 
 static inline avc_remote arch_pc(const struct arch_regs *regs)
 {
