@@ -164,7 +164,8 @@ void cut_go_on(struct process *process, struct thread *thread)
 	avc_remote place;
 
 	if (ARCH_FORGETS_CALLS || thread->borrowed || thread->stop_signal || !may_be_cut(&regs) ||
-	    !is_part(&regs) || !arch_is_native(&regs) || (!again && arch_call_done(&regs)) ||
+	    !is_part(&regs) || rewind_is_before(process, &regs, arch_syscall_nr(&regs)) ||
+	    !arch_is_native(&regs) || (!again && arch_call_done(&regs)) ||
 	    seccomp_bars_rest(process, thread->tid) || !waits_for_all(process, thread))
 		return;
 	place = again ? arch_pc(&regs) - ARCH_SYSCALL_BYTES : place_for(process, thread);

@@ -282,13 +282,11 @@ static long guess_call(const struct process *process, const struct arch_regs *re
 	return SYS_poll;          /* descriptors, how many, timeout */
 }
 
-/* Released a moment ago, and stopped again before it was back in its call: the kernel has moved it
- * back to the instruction, with the number of restart_syscall(2). */
-static bool is_about_to_restart(const struct process *process, const struct arch_regs *regs)
+bool rewind_is_before(const struct process *process, const struct arch_regs *regs, long nr)
 {
 	uint8_t code[ARCH_SYSCALL_BYTES];
 
-	return arch_syscall_result(regs) == SYS_restart_syscall &&
+	return arch_syscall_result(regs) == nr &&
 	       pread(process->mem_fd, code, sizeof code, (off_t)arch_pc(regs)) == sizeof code &&
 	       arch_is_syscall(code);
 }
@@ -301,7 +299,7 @@ static void note_call(const struct process *process, struct thread *t)
 
 	for (unsigned int n = 0; n < 3; n++)
 		now.arg[n] = arch_syscall_arg(&t->regs, n);
-	if (is_about_to_restart(process, &t->regs)) {
+	if (rewind_is_before(process, &t->regs, SYS_restart_syscall)) {
 		now.nr = SYS_restart_syscall;
 		now.pc += ARCH_SYSCALL_BYTES;
 	}
@@ -318,7 +316,7 @@ static bool is_rewound(const struct thread *thread)
 	return thread->rewound.mark && thread->rewound.mark == arch_call_mark(&thread->regs);
 }
 
-/* Like is_about_to_restart(), for a rewound call. */
+/* Like rewind_is_before(), for a rewound call. */
 static bool is_about_to_rewind(const struct thread *thread)
 {
 	return thread->rewound.mark && arch_result_mark(&thread->regs) == thread->rewound.mark;
@@ -524,7 +522,7 @@ void rewind_original(const struct thread *thread, struct arch_regs *regs)
 		arch_result_note(regs, (int32_t)arch_syscall_result(regs));
 	if (arch_syscall_nr(regs) == SYS_restart_syscall)
 		arch_syscall_nr_set(regs, thread->call.nr);
-	/* See is_about_to_restart(). */
+	/* See rewind_is_before(). */
 	if (arch_syscall_result(regs) == SYS_restart_syscall &&
 	    thread->call.pc == arch_pc(regs) + ARCH_SYSCALL_BYTES)
 		arch_result_note(regs, thread->call.nr);

@@ -423,6 +423,10 @@ bool cut_is_place(const struct process *process, avc_remote address);
 
 /* ---- rewind.c --------------------------------------------------------------------- */
 
+/* Whether a thread is about to make this call again: released a moment ago, it has been stopped again before
+ * it was back in it, and the kernel had moved it to the instruction, with the call's number for a result. */
+bool rewind_is_before(const struct process *process, const struct arch_regs *regs, long nr);
+
 /* A thread that just stopped: notes which call it is in.  If only we have interrupted that, sets
  * the thread to repeat it, or to return its timeout's result when its time is up. */
 void rewind_call(struct process *process, struct thread *thread);
