@@ -46,6 +46,8 @@
 #include "avckpt/engine.h"
 #include "state.h"
 
+#define SO_BUF_LOCK_ 72 /* asm/socket.h; a C library may lack it */
+
 /* ---- for the layers above ------------------------------------------------------- */
 
 /* Before a freeze: reads what can be read of the app's descriptors while it runs.  `parent`: a

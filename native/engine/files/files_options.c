@@ -19,7 +19,6 @@
 /* linux/udp.h, asm/socket.h; names that a C library may lack. */
 #define UDP_SEGMENT_ 103
 #define UDP_GRO_ 104
-#define SO_BUF_LOCK_ 72
 #define SO_PASSPIDFD_ 76
 
 /* In the order in which they are set.  A kernel or a kind of socket that lacks one reports it when

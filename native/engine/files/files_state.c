@@ -557,6 +557,31 @@ static bool all_passed(const struct file *want, const int *passed)
 	return !want->rights_lost;
 }
 
+/* The kernel takes messages until the room is used up, and pieces of another size than those in which it
+ * was written take more.  Of a stream that was full the last ones would not fit. */
+struct room {
+	int bytes, locks; /* -1: not known (before Linux 5.14) */
+};
+
+static bool get_more_room(int out, struct room *room)
+{
+	socklen_t size = sizeof room->bytes;
+
+	if (getsockopt(out, SOL_SOCKET, SO_BUF_LOCK_, &room->locks, &size))
+		room->locks = -1;
+	return getsockopt(out, SOL_SOCKET, SO_SNDBUF, &room->bytes, &size) == 0 &&
+	       setsockopt(out, SOL_SOCKET, SO_SNDBUFFORCE, &room->bytes, size) == 0;
+}
+
+static void give_room_back(int out, const struct room *room)
+{
+	const int half = room->bytes / 2; /* the kernel doubles it */
+
+	(void)setsockopt(out, SOL_SOCKET, SO_SNDBUFFORCE, &half, sizeof half);
+	if (room->locks >= 0)
+		(void)setsockopt(out, SOL_SOCKET, SO_BUF_LOCK_, &room->locks, sizeof room->locks);
+}
+
 const char *file_put_content(int fd, int other_fd, const struct file *want, const int *passed)
 {
 	const bool pipe = want->kind == FILE_PIPE,
@@ -565,8 +590,9 @@ const char *file_put_content(int fd, int other_fd, const struct file *want, cons
 	int in = pipe ? open_again(fd, O_RDONLY) : fd,
 	    out = pipe ? open_again(other_fd, O_WRONLY) : other_fd;
 	const char *problem = NULL;
+	struct room room;
 	uint32_t put = 0;
-	bool emptied;
+	bool emptied, has_more = false;
 
 	/* Unchanged, it still has its senders and descriptors. */
 	if (!pipe && file_has_messages(fd, want))
@@ -578,11 +604,16 @@ const char *file_put_content(int fd, int other_fd, const struct file *want, cons
 						       want->content_bytes - put)
 					       : put_message(out, want, put, passed);
 
+			if (n < 0 && errno == EAGAIN && !pipe && !has_more &&
+			    (has_more = get_more_room(out, &room)))
+				continue;
 			if (n <= 0)
 				break;
 			put += (uint32_t)n + (messages ? (uint32_t)sizeof(uint32_t) : 0);
 		}
 	}
+	if (has_more)
+		give_room_back(out, &room);
 	if (put < want->content_bytes || !emptied)
 		problem = "its contents could not be put back";
 	else if (!all_passed(want, passed))
