@@ -112,7 +112,7 @@ static bool waits_for_all(const struct process *process, const struct thread *th
 
 bool cut_contains(avc_remote parasite, avc_remote address)
 {
-	return address - (parasite + INJ_CUT_OFFSET) < INJ_CODE_BYTES - INJ_CUT_OFFSET;
+	return address >= parasite + INJ_CUT_OFFSET && address < parasite + INJ_CODE_BYTES;
 }
 
 bool cut_is_place(const struct process *process, avc_remote pc)
