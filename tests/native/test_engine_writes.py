@@ -39,7 +39,7 @@ def test_no_call_is_cut_short(kind: str, where: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize(
     "kind",
-    ["", "--hang-up", "--unix", "--unix --send", "--unix --receive", "--unix --receive --hang-up", "--tcp --receive"],
+    ["", "--hang-up", "--unix", "--unix --send", "--unix --receive", "--unix --receive --hang-up"],
 )
 def test_every_byte_once(kind: str, where: str, tmp_path: Path) -> None:
     """Of calls that were waiting at the checkpoint, and went on in the running application; the other end may be
