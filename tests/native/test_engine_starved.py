@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +89,17 @@ def too_late(event: dict[str, object]) -> bool:
     return event.get("kind") == "missed" and "get to run in time" in str(event)
 
 
+def checkpoint_until_late(guard: GuardProcess, cpu: int, pause_s: Callable[[], float] = float) -> None:
+    """Beside a hog, until threads have been too late often enough; nobody dies of it."""
+    with hog(cpu):
+        end = time.monotonic() + 90
+        while sum(map(too_late, guard.events)) < ENOUGH and time.monotonic() < end:
+            guard.command("checkpoint")
+            time.sleep(pause_s())
+    assert sum(map(too_late, guard.events)) >= ENOUGH
+    assert not [event for event in guard.events if event.get("kind") == "died"]
+
+
 @pytest.fixture
 def cpus() -> tuple[int, int]:
     """One CPU for the application and the hog, and one for everything else."""
@@ -105,13 +116,8 @@ def test_a_starved_application_is_let_go(cpus: tuple[int, int], tmp_path: Path) 
         guard.command("checkpoint")
         put_on(cpus[0], victim.app)
         put_on(cpus[1], guard.pid)
-        with hog(cpus[0]):
-            end = time.monotonic() + 90
-            while sum(map(too_late, guard.events)) < ENOUGH and time.monotonic() < end:
-                guard.command("checkpoint")
-                time.sleep(rng.uniform(0, 0.1))  # in which it is home again
-        assert sum(map(too_late, guard.events)) >= ENOUGH
-        assert not [event for event in guard.events if event.get("kind") == "died"]
+        # It is home again in between.
+        checkpoint_until_late(guard, cpus[0], lambda: rng.uniform(0, 0.1))
         for _ in range(10):
             assert guard.checkpoint()["kind"] == "checkpoint"
         victim.wait_beats(20)
@@ -123,12 +129,7 @@ def test_the_next_attempt_comes_at_once(cpus: tuple[int, int], tmp_path: Path) -
         guard.command("checkpoint")
         put_on(cpus[0], victim.app)
         put_on(cpus[1], guard.pid)
-        with hog(cpus[0]):
-            end = time.monotonic() + 90
-            while sum(map(too_late, guard.events)) < ENOUGH and time.monotonic() < end:
-                guard.command("checkpoint")
-        assert sum(map(too_late, guard.events)) >= ENOUGH
-        assert not [event for event in guard.events if event.get("kind") == "died"]
+        checkpoint_until_late(guard, cpus[0])
         wait_until(lambda: guard.command("checkpoint")["kind"] == "checkpoint", 15, "checkpoints go on")
         victim.wait_beats(20)
 

@@ -192,6 +192,12 @@ def test_when_it_is_due(interval_s: float, due_s: float | None, again_s: float |
     assert guard.c.policy_due_again(guard.config, due, 10 * SECOND) == again
 
 
+@pytest.mark.parametrize(("due_s", "pause_s", "then_s"), [(13, 1, 13), (11, 2, 12), (None, 2, None)])
+def test_the_application_runs_before_the_next_one(due_s: float | None, pause_s: int, then_s: float | None) -> None:
+    due, then = (NEVER if s is None else s * SECOND for s in (due_s, then_s))
+    assert Guarded().c.policy_due_after(due, pause_s * SECOND, 10 * SECOND) == then
+
+
 def test_a_failed_checkpoint_leaves_what_is_held_unless_nothing_is_any_good() -> None:
     guard = Guarded()
     c, policy = guard.c, guard.policy

@@ -93,16 +93,23 @@ static void connect_tcp(int ends[2])
 	close(listener);
 }
 
+/* A stream: --tcp or --unix. */
+static void connect_stream(int ends[2])
+{
+	if (over_tcp)
+		connect_tcp(ends);
+	else
+		must(socketpair(AF_UNIX, SOCK_STREAM, 0, ends) == 0, "socketpair");
+}
+
 static void begin(void)
 {
 	sigset_t all, before;
 	pthread_t thread;
 	int ends[2];
 
-	if (over_tcp)
-		connect_tcp(ends);
-	else if (over_unix)
-		must(socketpair(AF_UNIX, SOCK_STREAM, 0, ends) == 0, "socketpair");
+	if (over_tcp || over_unix)
+		connect_stream(ends);
 	else
 		must(pipe(ends) == 0, "pipe");
 	other = ends[0];
@@ -167,10 +174,7 @@ static void stall(void)
 	uint64_t began;
 	int ends[2];
 
-	if (over_tcp)
-		connect_tcp(ends);
-	else
-		must(socketpair(AF_UNIX, SOCK_STREAM, 0, ends) == 0, "socketpair");
+	connect_stream(ends);
 	must(setsockopt(ends[1], SOL_SOCKET, SO_RCVTIMEO, &timeout, sizeof timeout) == 0,
 	     "SO_RCVTIMEO");
 	own = ends[1];

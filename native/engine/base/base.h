@@ -216,6 +216,8 @@ int proc_link(pid_t pid, const char *name, char *buf, size_t size);
 /* statx(2) of "/proc/PID/NAME", and of a descriptor of ours, without a request to a file server. */
 bool proc_look(pid_t pid, const char *name, unsigned int what, struct statx *st);
 bool fd_look(int fd, unsigned int what, struct statx *st);
+/* An integer option, getsockopt(2); -1: it has none of that name. */
+int fd_option(int fd, int level, int name);
 /* A device as in struct mapping. */
 static inline uint64_t device_number(unsigned int major, unsigned int minor)
 {

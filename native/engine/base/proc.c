@@ -151,6 +151,14 @@ bool fd_look(int fd, unsigned int what, struct statx *st)
 	return !statx(fd, "", AT_EMPTY_PATH | AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT, what, st);
 }
 
+int fd_option(int fd, int level, int name)
+{
+	int value = 0;
+	socklen_t bytes = sizeof value;
+
+	return getsockopt(fd, level, name, &value, &bytes) ? -1 : value;
+}
+
 int proc_same_file(pid_t a, pid_t b, const char *name)
 {
 	struct statx is, other;

@@ -503,8 +503,6 @@ uint8_t file_shut(int fd);
 /* How often a count is read at most, to lower it to what it was. */
 #define FILE_COUNT_READS 1000
 void file_look_at_socket(int fd, struct file *file);
-/* An integer option, getsockopt(2); -1: it has none of that name. */
-int file_option(int fd, int level, int name);
 void file_look_at_tcp(int fd, struct file *file, const struct file_socket *socket);
 void files_find_peers(struct files *files, pid_t pid);
 /* Whether it, or what it is connected to, was bound. */

@@ -135,7 +135,7 @@ static const char *why_not(int fd)
 		return "an end of it was shut down or closed";
 	if (state.revents)
 		return "it has urgent data";
-	return file_option(fd, SOL_SOCKET, SO_PEEK_OFF) < 0 ? NULL : "it has SO_PEEK_OFF";
+	return fd_option(fd, SOL_SOCKET, SO_PEEK_OFF) < 0 ? NULL : "it has SO_PEEK_OFF";
 }
 
 /* IPv4 as mapped to IPv6, because one end may use that. */

@@ -80,10 +80,10 @@ static bool end_connection(int fd, int domain, const struct file *file)
 
 static bool drop_from_socket(int fd, const struct file *file, bool inside)
 {
-	const int type = file_option(fd, SOL_SOCKET, SO_TYPE),
-		  domain = file_option(fd, SOL_SOCKET, SO_DOMAIN);
+	const int type = fd_option(fd, SOL_SOCKET, SO_TYPE),
+		  domain = fd_option(fd, SOL_SOCKET, SO_DOMAIN);
 
-	if (file_option(fd, SOL_SOCKET, SO_ACCEPTCONN) > 0)
+	if (fd_option(fd, SOL_SOCKET, SO_ACCEPTCONN) > 0)
 		return file_turn_away(fd);
 	if (type == SOCK_STREAM && !inside)
 		return end_connection(fd, domain, file);

@@ -97,9 +97,9 @@ static void note_flight(int fd, const struct statx *st, struct file *file)
 		.flags = fcntl(fd, F_GETFL),
 	};
 	if (S_ISSOCK(st->stx_mode)) {
-		more[file->flight_count].domain = file_option(fd, SOL_SOCKET, SO_DOMAIN);
-		more[file->flight_count].type = file_option(fd, SOL_SOCKET, SO_TYPE);
-		more[file->flight_count].protocol = file_option(fd, SOL_SOCKET, SO_PROTOCOL);
+		more[file->flight_count].domain = fd_option(fd, SOL_SOCKET, SO_DOMAIN);
+		more[file->flight_count].type = fd_option(fd, SOL_SOCKET, SO_TYPE);
+		more[file->flight_count].protocol = fd_option(fd, SOL_SOCKET, SO_PROTOCOL);
 	}
 	file->flight_count++;
 }
@@ -162,8 +162,7 @@ static ssize_t peek(int fd, struct file *file, void *to, size_t room)
 	if (lands)
 		hear_control(&head, file);
 	/* No room for them: truncation shows that there are some. */
-	if (head.msg_flags & MSG_CTRUNC &&
-	    (lands || file_option(fd, SOL_SOCKET, SO_PASSCRED) <= 0)) {
+	if (head.msg_flags & MSG_CTRUNC && (lands || fd_option(fd, SOL_SOCKET, SO_PASSCRED) <= 0)) {
 		file->rights_lost = true;
 		file->rights = RIGHTS_UNKNOWN;
 	}
@@ -222,7 +221,7 @@ static void trim(struct file *file)
 /* It is an option of the app's socket, which is reset even if we die. */
 static void look_again(struct process *process, int fd, struct file *file)
 {
-	const int first = 0, before = file_option(fd, SOL_SOCKET, SO_PEEK_OFF);
+	const int first = 0, before = fd_option(fd, SOL_SOCKET, SO_PEEK_OFF);
 
 	if (parasite_set_undo(process, SYS_setsockopt,
 			      ARGUMENTS((uint64_t)file->fd, SOL_SOCKET, SO_PEEK_OFF,
@@ -264,7 +263,7 @@ void file_keep_messages(struct process *process, int fd, struct file *file, uint
 
 bool file_has_messages(int fd, const struct file *want)
 {
-	const int first = 0, before = file_option(fd, SOL_SOCKET, SO_PEEK_OFF);
+	const int first = 0, before = fd_option(fd, SOL_SOCKET, SO_PEEK_OFF);
 	struct file is = { .kind = FILE_SOCKET, .socket = want->socket };
 	bool same;
 

@@ -42,14 +42,6 @@
 
 /* ---- sockets ---------------------------------------------------------------- */
 
-int file_option(int fd, int level, int name)
-{
-	int value = 0;
-	socklen_t bytes = sizeof value;
-
-	return getsockopt(fd, level, name, &value, &bytes) ? -1 : value;
-}
-
 static bool is_idle(int fd, const struct file_socket *s)
 {
 	struct pollfd state = { .fd = fd, .events = POLLRDHUP };
@@ -112,11 +104,11 @@ void file_look_at_socket(int fd, struct file *file)
 
 	if (!s)
 		return;
-	s->domain = file_option(fd, SOL_SOCKET, SO_DOMAIN);
-	s->type = file_option(fd, SOL_SOCKET, SO_TYPE);
+	s->domain = fd_option(fd, SOL_SOCKET, SO_DOMAIN);
+	s->type = fd_option(fd, SOL_SOCKET, SO_TYPE);
 	s->protocol = s->domain == AF_CAN ? can_protocol(fd, s->type)
-					  : file_option(fd, SOL_SOCKET, SO_PROTOCOL);
-	s->listening = file_option(fd, SOL_SOCKET, SO_ACCEPTCONN) > 0;
+					  : fd_option(fd, SOL_SOCKET, SO_PROTOCOL);
+	s->listening = fd_option(fd, SOL_SOCKET, SO_ACCEPTCONN) > 0;
 	s->local_bytes = sizeof s->local;
 	if (getsockname(fd, (struct sockaddr *)&s->local, &s->local_bytes))
 		s->local_bytes = 0;
@@ -565,12 +557,10 @@ struct room {
 
 static bool get_more_room(int out, struct room *room)
 {
-	socklen_t size = sizeof room->bytes;
-
-	if (getsockopt(out, SOL_SOCKET, SO_BUF_LOCK_, &room->locks, &size))
-		room->locks = -1;
-	return getsockopt(out, SOL_SOCKET, SO_SNDBUF, &room->bytes, &size) == 0 &&
-	       setsockopt(out, SOL_SOCKET, SO_SNDBUFFORCE, &room->bytes, size) == 0;
+	room->locks = fd_option(out, SOL_SOCKET, SO_BUF_LOCK_);
+	room->bytes = fd_option(out, SOL_SOCKET, SO_SNDBUF);
+	return room->bytes > 0 &&
+	       setsockopt(out, SOL_SOCKET, SO_SNDBUFFORCE, &room->bytes, sizeof room->bytes) == 0;
 }
 
 static void give_room_back(int out, const struct room *room)

@@ -641,10 +641,7 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 /* However short its interval is: the app runs for at least as long as it was just stopped. */
 static void let_it_run(struct avc_guard *guard)
 {
-	const uint64_t until = now_ns() + guard->held_ns;
-
-	if (guard->next_ns < until)
-		guard->next_ns = until;
+	guard->next_ns = policy_due_after(guard->next_ns, guard->held_ns, now_ns());
 }
 
 /* One was missed.  avckpt.interval=auto has pauses of its own (guard_pace_missed()). */

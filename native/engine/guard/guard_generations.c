@@ -435,7 +435,9 @@ void guard_reap_dead(struct avc_guard *guard)
 			news[1].fd = -1; /* init is just ending */
 	}
 	/* It had reported a death that it does not undo. */
-	for (uint32_t i = 0; i < count && !proc_is_killed(guard->channel.init); i++)
+	if (proc_is_killed(guard->channel.init))
+		return;
+	for (uint32_t i = 0; i < count; i++)
 		guard_emit(guard, &events[i]);
 }
 

@@ -106,22 +106,23 @@ void guard_pace_taken(struct avc_guard *guard, const struct avc_event *event)
 
 /* A failed checkpoint has stopped the app, too: the pause after it keeps to the budget, but is no
  * longer than a fixed interval would be. */
-static uint64_t paid_for(const struct avc_guard *guard)
+static uint64_t pause_to_pay(const struct avc_guard *guard)
 {
 	const uint64_t pause = guard->held_ns * 1000000 / guard->config.budget_freeze_ppm,
 		       longest = guard->config.interval_ns;
 
-	return now_ns() + (pause < longest ? pause : longest);
+	return pause < longest ? pause : longest;
 }
 
 void guard_pace_missed(struct avc_guard *guard)
 {
+	const uint64_t now = now_ns();
+
 	if (!policy_is_automatic(&guard->config))
 		return;
 	guard_pace_end(guard);
-	guard->next_ns = policy_try_again(&guard->pace, &guard->config, now_ns());
-	if (guard->next_ns < paid_for(guard))
-		guard->next_ns = paid_for(guard);
+	guard->next_ns = policy_due_after(policy_try_again(&guard->pace, &guard->config, now),
+					  pause_to_pay(guard), now);
 }
 
 void guard_pace_restored(struct avc_guard *guard)

@@ -71,6 +71,11 @@ uint64_t policy_due(const struct avc_config *config, uint64_t now)
 	return config->interval_ns ? now + config->interval_ns : POLICY_NEVER;
 }
 
+uint64_t policy_due_after(uint64_t due, uint64_t pause_ns, uint64_t now)
+{
+	return due > now + pause_ns ? due : now + pause_ns;
+}
+
 /* Never later than planned, unless there are to be none. */
 uint64_t policy_due_again(const struct avc_config *config, uint64_t due, uint64_t now)
 {

@@ -63,6 +63,8 @@ struct policy {
 uint64_t policy_first_due(const struct avc_config *config, uint64_t now);
 /* An interval from now; POLICY_NEVER: on command only. */
 uint64_t policy_due(const struct avc_config *config, uint64_t now);
+/* `due`, or later: the app is to run first for as long as that. */
+uint64_t policy_due_after(uint64_t due, uint64_t pause_ns, uint64_t now);
 /* The one that was due at `due`, by a new configuration. */
 uint64_t policy_due_again(const struct avc_config *config, uint64_t due, uint64_t now);
 

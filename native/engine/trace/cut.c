@@ -58,23 +58,16 @@ static bool is_part(const struct arch_regs *regs)
 	       (uint64_t)result + arch_call_done(regs) < CALL_MAX;
 }
 
-static long option(int fd, int name)
-{
-	int value = 0;
-	socklen_t bytes = sizeof value;
-
-	return getsockopt(fd, SOL_SOCKET, name, &value, &bytes) ? -1 : value;
-}
-
 /* What is received from several senders is never joined with SO_PASSCRED. */
 static bool is_stream(int fd)
 {
-	const long domain = option(fd, SO_DOMAIN), protocol = option(fd, SO_PROTOCOL);
+	const int domain = fd_option(fd, SOL_SOCKET, SO_DOMAIN),
+		  protocol = fd_option(fd, SOL_SOCKET, SO_PROTOCOL);
 
-	if (option(fd, SO_TYPE) != SOCK_STREAM)
+	if (fd_option(fd, SOL_SOCKET, SO_TYPE) != SOCK_STREAM)
 		return false;
 	if (domain == AF_UNIX)
-		return !option(fd, SO_PASSCRED);
+		return !fd_option(fd, SOL_SOCKET, SO_PASSCRED);
 	return (domain == AF_INET || domain == AF_INET6) &&
 	       (protocol == IPPROTO_TCP || protocol == IPPROTO_MPTCP);
 }
@@ -94,14 +87,14 @@ static bool waits_for_all(const struct process *process, const struct thread *th
 {
 	const int number = (int)arch_syscall_arg(&thread->regs, 0);
 	const bool receives = arch_syscall_nr(&thread->regs) == SYS_recvfrom;
-	char path[64];
+	char name[32];
 	struct statx st;
 	bool waits;
 	int fd;
 
 	/* To close a duplicate of a file would be a request to its server, which may be stopped. */
-	snprintf(path, sizeof path, "/proc/%d/fd/%d", thread->tid, number);
-	if (statx(AT_FDCWD, path, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT, STATX_TYPE, &st) ||
+	snprintf(name, sizeof name, "fd/%d", number);
+	if (!proc_look(thread->tid, name, STATX_TYPE, &st) ||
 	    (!S_ISFIFO(st.stx_mode) && !S_ISSOCK(st.stx_mode)))
 		return false;
 	fd = proc_borrow_fd(process->pidfd, number);

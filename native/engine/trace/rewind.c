@@ -133,10 +133,7 @@ static uint64_t socket_timeout(int fd, int option)
 
 static bool is_unix_socket(int fd)
 {
-	int domain = 0;
-	socklen_t bytes = sizeof domain;
-
-	return getsockopt(fd, SOL_SOCKET, SO_DOMAIN, &domain, &bytes) == 0 && domain == AF_UNIX;
+	return fd_option(fd, SOL_SOCKET, SO_DOMAIN) == AF_UNIX;
 }
 
 static uint64_t time_of_socket(const struct process *process, int app_fd, enum timeout kind,

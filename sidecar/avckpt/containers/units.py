@@ -295,8 +295,7 @@ class UnitListener:
 
     def _accept(self) -> None:
         if is_busy():
-            self._loop.remove_reader(self._socket)
-            self._loop.call_later(BUSY_S, self._accept_again)
+            self._accept_later(BUSY_S)
             return
         try:
             connection, _ = self._socket.accept()
@@ -304,8 +303,7 @@ class UnitListener:
             return
         except OSError as error:
             log.error("a unit cannot be accepted: %s", error.strerror)
-            self._loop.remove_reader(self._socket)
-            self._loop.call_later(WAIT_S, self._accept_again)
+            self._accept_later(WAIT_S)
             return
         connection.setblocking(False)
         try:
@@ -334,6 +332,10 @@ class UnitListener:
         if len(self._parties) > PARTIES_MOST:
             self._parties.popitem(last=False)
         return allowance.has_one()
+
+    def _accept_later(self, seconds: float) -> None:
+        self._loop.remove_reader(self._socket)
+        self._loop.call_later(seconds, self._accept_again)
 
     def _accept_again(self) -> None:
         if self._socket.fileno() >= 0:
