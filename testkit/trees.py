@@ -59,7 +59,7 @@ class Tree:
     def members(self) -> list[Member]:
         """The application's processes.
 
-        A worker's holder is made by the worker (process_hold_stopped() in infect.c): for a moment it and the task
+        A worker's holder is made by the worker (process_hold_stopped() in holder.c): for a moment it and the task
         that clones it are below the worker.
         """
 

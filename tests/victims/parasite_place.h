@@ -8,7 +8,7 @@
 #include "parasite.h"
 #include "victim.h"
 
-/* Parasites lie at multiples of 64 MB between these two (native/engine/process/infect.c). */
+/* Parasites lie at multiples of 64 MB between these two (native/engine/process/porter.c). */
 #define PLACES_START (UINT64_C(32) << 40)
 #define PLACES_END (UINT64_C(64) << 40)
 #define PLACES_DISTANCE (UINT64_C(64) << 20)

@@ -2,7 +2,7 @@
  *
  * One checkpoint.  Every thread of every known process is stopped; then, and only then, the
  * processes are cloned: the main one by its main thread, the others by their holders, which share
- * their memory (infect.c).  While the kernel does that, the state of this instant is read.  Then
+ * their memory (holder.c).  While the kernel does that, the state of this instant is read.  Then
  * everything is released.  What can wait is done afterwards (generation.c).
  */
 #include <errno.h>

@@ -188,7 +188,7 @@ bool guard_knows_tracee(pid_t tid, const void *arg)
 }
 
 /* One that is not in a parasite belongs to the app (CLONE_PARENT, CLONE_PTRACE), or ends by itself
- * (infect.c); it is released. */
+ * (holder.c); it is released. */
 static bool is_not_lost(pid_t pid, const void *arg)
 {
 	const struct avc_guard *guard = arg;

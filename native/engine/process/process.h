@@ -4,7 +4,8 @@
  *
  *   process.c       one of them: opened, its threads queried
  *   stop.c          ... stopped, released
- *   infect.c        injects parasite and holder
+ *   infect.c        injects the parasite (infect.h)
+ *   holder.c        ... and the holder
  *   executed.c      ... which are gone when it executes another program
  *   tracker.c       which of its pages are written
  *   watcher.c       ... where its container may not watch memory
@@ -154,25 +155,30 @@ int process_infect(struct process *process, uint32_t slots, timer_t timer, uint6
 /* The same while everything is stopped. */
 int process_infect_stopped(struct process *process, uint32_t slots,
 			   struct avc_error *err) warn_unused;
-/* Erases the stubs that have stayed.  No thread may be in one, or need it (process_needs_old()). */
+/* Erases the stubs that have stayed (cave.c).  No thread may be in one, or need it
+ * (process_needs_old()). */
 void process_drop_stubs(struct process *process);
-/* Makes the holder of one that is not the main process, by its stopped main thread. */
+
+/* ---- holder.c ----------------------------------------------------------------- */
+
+/* Makes the holder. */
+int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
+		 struct avc_error *err) warn_unused;
+/* The same of one that is not the main process, by its stopped main thread. */
 int process_hold_stopped(struct process *process, pid_t init, struct avc_error *err) warn_unused;
+/* Drops it.  process_unhold_soon() does not wait until its descriptors are closed and its memory is
+ * freed. */
+void process_unhold(struct process *process);
+void process_unhold_soon(struct process *process);
+/* From then on the holder belongs to the caller, with its pidfd (-1: there was none). */
+pid_t process_detach_holder(struct process *process, int *pidfd);
+/* Whether it has other directories, or another umask (-1: to be looked up), than its holder, which
+ * its templates get. */
+bool process_has_moved(const struct process *process, int32_t umask);
 /* Makes a stopped process that adopts orphans (PR_SET_CHILD_SUBREAPER) leave them to init.  If we
  * die meanwhile, it resumes by itself. */
 int process_pause_adoption(struct process *process, struct avc_error *err) warn_unused;
 int process_resume_adoption(struct process *process, struct avc_error *err) warn_unused;
-/* Makes the holder; process_unhold() drops it.  process_unhold_soon() does not wait until its
- * descriptors are closed and its memory is freed. */
-int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
-		 struct avc_error *err) warn_unused;
-void process_unhold(struct process *process);
-/* Whether it has other directories, or another umask (-1: to be looked up), than its holder, which
- * its templates get. */
-bool process_has_moved(const struct process *process, int32_t umask);
-void process_unhold_soon(struct process *process);
-/* From then on the holder belongs to the caller, with its pidfd (-1: there was none). */
-pid_t process_detach_holder(struct process *process, int *pidfd);
 
 /* ---- executed.c ---------------------------------------------------------------------- */
 

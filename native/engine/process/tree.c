@@ -354,6 +354,45 @@ static int check_shared(struct tree *tree, const struct tree_entry *entry, struc
 			      proc_inside(entry->pid));
 }
 
+/* One that is new.  If it turns out that it has ended: entry->ending. */
+static int open_new(struct tree *tree, struct tree_entry *entry, struct avc_error *err)
+{
+	struct avc_error gone = { 0 };
+	uint64_t shared;
+
+	if (check_sharing(tree, entry, &shared, err))
+		return -1;
+	if (shared && entry->parent < 0 && may_be_left(tree, entry->pid))
+		return fail(err, AVC_RETRY, 0, entry->pid, "look at processes", "kcmp",
+			    "process %d may be ending", proc_inside(entry->pid));
+	entry->process = add_process(tree, entry->pid, entry->stat.start, &gone);
+	if (!entry->process && gone.code != AVC_GONE) {
+		*err = gone;
+		return -1;
+	}
+	entry->ending = !entry->process;
+	if (entry->process)
+		entry->process->shared = shared;
+	return 0;
+}
+
+/* Any but the main process.  One that has ended has no entry->process. */
+static int look_at_entry(struct tree *tree, struct tree_entry *entry, struct avc_error *err)
+{
+	struct proc_stat stat;
+
+	if (look_at(tree, entry->pid, &stat)) {
+		entry->pid = 0; /* it has just been reaped */
+		return 0;
+	}
+	entry->stat = stat;
+	entry->ended = is_zombie(&stat);
+	if (entry->ended)
+		return 0;
+	entry->process = find_process(tree, entry->pid, stat.start);
+	return entry->process ? check_shared(tree, entry, err) : open_new(tree, entry, err);
+}
+
 int tree_scan(struct tree *tree, struct avc_error *err)
 {
 	tree->count = 0;
@@ -364,50 +403,15 @@ int tree_scan(struct tree *tree, struct avc_error *err)
 	if (look_below_init(tree, err))
 		return -1;
 	for (uint32_t i = 0; i < tree->count; i++) {
-		struct tree_entry *entry = &tree->entry[i];
-		struct proc_stat stat;
+		const struct process *process;
 
-		if (i && look_at(tree, entry->pid, &stat)) {
-			entry->pid = 0; /* it has just been reaped */
-			continue;
-		}
-		if (i)
-			entry->stat = stat;
-		if (i && is_zombie(&stat)) {
-			entry->ended = true;
-			continue;
-		}
-		if (i) {
-			entry->process = find_process(tree, entry->pid, stat.start);
-			if (entry->process && check_shared(tree, entry, err))
-				return -1;
-			if (!entry->process) {
-				struct avc_error gone = { 0 };
-				uint64_t shared;
-
-				if (check_sharing(tree, entry, &shared, err))
-					return -1;
-				if (shared && entry->parent < 0 && may_be_left(tree, entry->pid))
-					return fail(err, AVC_RETRY, 0, entry->pid,
-						    "look at processes", "kcmp",
-						    "process %d may be ending",
-						    proc_inside(entry->pid));
-				entry->process = add_process(tree, entry->pid, stat.start, &gone);
-				if (!entry->process && gone.code != AVC_GONE) {
-					*err = gone;
-					return -1;
-				}
-				if (!entry->process) {
-					entry->ending = true;
-					continue;
-				}
-				entry->process->shared = shared;
-			}
-		}
+		if (i && look_at_entry(tree, &tree->entry[i], err))
+			return -1;
+		process = tree->entry[i].process;
 		/* Thread by thread only if the last checkpoint did not find that it has no child: a
 		 * new one is found by the next checkpoint. */
-		if (!entry->process->childless &&
-		    look_below(tree, entry->process->task_dirfd, (int)i, err))
+		if (process && !process->childless &&
+		    look_below(tree, process->task_dirfd, (int)i, err))
 			return -1;
 	}
 	return 0;

@@ -180,7 +180,7 @@ static const struct kind wanted_for_trees[] = {
 /* What the container's own filters must allow, too, if none can be suspended: an application need not
  * make such calls. */
 static const struct kind needed[] = {
-	/* of the porter, and the stub that clones it (infect.c) */
+	/* of the porter, and the stub that clones it (porter.c) */
 	{ SYS_rt_sigprocmask, SIG_SETMASK },
 	{ SYS_clone, CLONE_VM | CLONE_FILES },
 	{ SYS_clone, CLONE_VM | CLONE_FILES | CLONE_THREAD | CLONE_SIGHAND | CLONE_FS },
@@ -711,7 +711,7 @@ static bool is_wanted(const struct arch_regs *regs, pid_t inside)
 		       arch_syscall_arg(regs, 1) == TIOCSCTTY;
 	case SYS_mmap:
 	case SYS_pkey_mprotect:
-	case SYS_mprotect: /* only the porter maps code (infect.c) */
+	case SYS_mprotect: /* only the porter maps code (porter.c) */
 		return !inside || !(arch_syscall_arg(regs, 2) & PROT_EXEC);
 	case SYS_userfaultfd: /* in its own descriptor table, for the guard to take (tracker.c) */
 		return inside == SECCOMP_WATCHER;

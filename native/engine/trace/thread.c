@@ -357,48 +357,93 @@ static void take_child(struct process *process, struct thread *thread, pid_t chi
 					   ARCH_STUB_BYTES) == 0;
 }
 
+/* Registers can only be read of a stopped task.  If no event is pending then, the stop has been consumed
+ * already, and it would stay stopped forever. */
+static struct stop next_stop(pid_t tid)
+{
+	struct stop stop = tracee_wait(tid, WNOHANG);
+	struct arch_regs now;
+
+	if (stop.kind != STOP_NONE || arch_regs_get(tid, &now))
+		return stop;
+	stop = tracee_wait(tid, WNOHANG);
+	if (stop.kind == STOP_NONE)
+		stop.kind = STOP_TRAP;
+	return stop;
+}
+
+/* It may have returned by itself meanwhile, and would never stop again.  Before that it needs a CPU:
+ * interrupted again and again, it would never make its calls. */
+static void interrupt_running(const struct process *process, const struct thread *thread)
+{
+	if (!thread->borrowed || !thread->borrowed_for || has_made_calls(process))
+		ptrace(PTRACE_INTERRUPT, thread->tid, NULL, NULL);
+}
+
+/* Registers cannot be changed at this stop: lets it reach another one.  A clone that is interrupted
+ * where it begins is begun again (ERESTARTNOINTR), and again. */
+static void leave_call(const struct process *process, const struct thread *thread,
+		       struct stop *stop)
+{
+	struct arch_regs now;
+
+	if (!tracee_enters_call(thread->tid) &&
+	    (arch_regs_get(thread->tid, &now) || !must_go_on(process, thread, &now)))
+		ptrace(PTRACE_INTERRUPT, thread->tid, NULL, NULL);
+	seccomp_go_on(thread->tid, stop);
+}
+
+/* True if another task has to be waited for in its place. */
+static bool note_end(struct process *process, struct thread *thread)
+{
+	const pid_t tid = thread->tid;
+
+	process->lost = process->lost || thread->borrowed;
+	seccomp_end_supervision(tid);
+	thread->attached = false;
+	thread->borrowed = false;
+	return follow_exec(process, tid);
+}
+
+/* Its registers become the app's, if they are not. */
+static void send_home(struct process *process, struct thread *thread, const struct arch_regs *now)
+{
+	struct avc_error ignored = { 0 };
+
+	if (is_in_stub(thread, now) ||
+	    (thread->borrowed && parasite_contains(&process->parasite, arch_pc(now)))) {
+		thread_give_back(thread, &ignored);
+		return;
+	}
+	if (thread->borrowed && thread->borrowed_for)
+		thread->borrowed_for->left_ns = now_ns();
+	thread->borrowed = false;
+	thread->regs = *now;
+	rewind_call(process, thread);
+	rewind_continued(process, thread);
+}
+
 /* True while it still has to be waited for. */
 static bool straggle(struct process *process, struct thread *thread)
 {
 	const pid_t tid = thread->tid;
-	struct avc_error ignored = { 0 };
-	struct stop stop = tracee_wait(tid, WNOHANG);
+	struct stop stop = next_stop(tid);
 	struct arch_regs now;
-
-	/* Registers can only be read of a stopped task. If no event is pending, the stop has been
-	 * consumed already, and it would stay stopped forever. */
-	if (stop.kind == STOP_NONE && arch_regs_get(tid, &now) == 0) {
-		stop = tracee_wait(tid, WNOHANG);
-		if (stop.kind == STOP_NONE)
-			stop.kind = STOP_TRAP;
-	}
 
 	switch (stop.kind) {
 	case STOP_NONE:
-		/* It may have returned by itself meanwhile, and would never stop again.  Before that
-		 * it needs a CPU: interrupted again and again, it would never make its calls. */
-		if (!thread->borrowed || !thread->borrowed_for || has_made_calls(process))
-			ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
+		interrupt_running(process, thread);
 		return true;
 	case STOP_DYING:
 	case STOP_DEADLINE:
 		return true;
 	case STOP_EXIT:
-		process->lost = process->lost || thread->borrowed;
-		seccomp_end_supervision(tid);
-		thread->attached = false;
-		thread->borrowed = false;
-		return follow_exec(process, tid);
+		return note_end(process, thread);
 	case STOP_FORK:
 		take_child(process, thread, stop.message);
 		/* fall through */
 	case STOP_SYSCALL:
-		/* Registers cannot be changed at this stop: let it reach another one.  A clone that
-		 * is interrupted where it begins is begun again (ERESTARTNOINTR), and again. */
-		if (!tracee_enters_call(tid) &&
-		    (arch_regs_get(tid, &now) || !must_go_on(process, thread, &now)))
-			ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
-		seccomp_go_on(tid, &stop);
+		leave_call(process, thread, &stop);
 		return true;
 	default:
 		break;
@@ -408,17 +453,7 @@ static bool straggle(struct process *process, struct thread *thread)
 			seccomp_go_on(tid, &stop);
 			return true;
 		}
-		if (is_in_stub(thread, &now) ||
-		    (thread->borrowed && parasite_contains(&process->parasite, arch_pc(&now)))) {
-			thread_give_back(thread, &ignored);
-		} else {
-			if (thread->borrowed && thread->borrowed_for)
-				thread->borrowed_for->left_ns = now_ns();
-			thread->borrowed = false;
-			thread->regs = now;
-			rewind_call(process, thread);
-			rewind_continued(process, thread);
-		}
+		send_home(process, thread, &now);
 	}
 	if (ptrace(PTRACE_DETACH, tid, NULL, (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0)))
 		return true; /* killed: to be reaped */

@@ -110,7 +110,7 @@ struct thread {
 	int stop_signal; /* the process is stopped by job control           */
 	int block;       /* of the slot, main thread 0; -1: not in the image */
 	bool borrowed;   /* sent into the parasite; regs and sigmask are its own  */
-	struct parasite *borrowed_for; /* NULL: before there is one (infect.c)              */
+	struct parasite *borrowed_for; /* NULL: before there is one (porter.c)              */
 	avc_remote stub;               /* where it has been sent instead                     */
 	uint32_t filters_known;        /* of seccomp, at the last check                   */
 	uint32_t filter_count;         /* ... when it was queried (state/filters.c)        */
@@ -215,7 +215,7 @@ struct process {
 	} old_parasite[OLD_PARASITES_MAX];
 	uint32_t old_parasites, checkpoints;
 	uint64_t given; /* signals for any thread: those released at this stop get them */
-	/* Stubs that stay, because a task may still be in them, or return there (infect.c). */
+	/* Stubs that stay, because a task may still be in them, or return there (cave.c). */
 	avc_remote stubs_start, stubs_end;
 	/* A thread died while it may have been cloning: there may be a tracee that is on no list
 	 * (init_channel_kill_lost). */
