@@ -30,7 +30,7 @@ static const uint8_t needed[] = {
 	CAP_CHECKPOINT_RESTORE, /* ns_last_pid, /proc/PID/map_files                        */
 	CAP_KILL,               /* templates have the application's user                   */
 	CAP_SYS_RESOURCE,       /* prlimit(2) beyond a hard limit, oom_score_adj           */
-	CAP_SYS_NICE,           /* SCHED_FIFO while an application waits                   */
+	CAP_SYS_NICE,           /* SCHED_RR while an application waits                   */
 	CAP_DAC_OVERRIDE,       /* sockets and files in the container, of its users        */
 	CAP_DAC_READ_SEARCH,
 	CAP_FOWNER,

@@ -182,7 +182,7 @@ def test_units_of_one_pid_namespace_go_back_together(local: LocalSidecar) -> Non
 
 def test_all_hurry_until_they_are_back_and_no_longer(local: LocalSidecar, ring: list[Container]) -> None:
     assert local.process is not None
-    lent = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+    lent = os.SCHED_RR | os.SCHED_RESET_ON_FORK
     daemon = local.process.pid
     everybody = [daemon, *(row(local, member)["guard_pid"] for member in ring), *(member.init_pid for member in ring)]
     for restores in (1, 2):
@@ -207,16 +207,16 @@ def test_all_hurry_from_the_meeting_before_a_freeze_on(local: LocalSidecar, ring
     try:
         # They wait a second for it, with their applications running: longer than any freeze.
         for _ in range(10):
-            wait_until(lambda: os.sched_getscheduler(waiting) == os.SCHED_FIFO, 5, "a guard waits for another one")
+            wait_until(lambda: os.sched_getscheduler(waiting) == os.SCHED_RR, 5, "a guard waits for another one")
             hurries = set()
             for _ in range(10):
                 time.sleep(0.02)
                 hurries.add(os.sched_getscheduler(waiting))
-            if hurries == {os.SCHED_FIFO}:
+            if hurries == {os.SCHED_RR}:
                 break
     finally:
         os.kill(held, signal.SIGCONT)
-    assert hurries == {os.SCHED_FIFO}
+    assert hurries == {os.SCHED_RR}
     wait_for_line(local, ring, row(local, ring[1])["line"])
 
 

@@ -192,7 +192,7 @@ def urgent_s(pid: int, is_over: Callable[[], bool]) -> float:
     """How much CPU time its main thread takes with a real-time priority until then."""
     total, before = 0.0, thread_s(pid)
     while not is_over():
-        now, is_urgent = thread_s(pid), os.sched_getscheduler(pid) == os.SCHED_FIFO
+        now, is_urgent = thread_s(pid), os.sched_getscheduler(pid) == os.SCHED_RR
         total, before = total + (now - before if is_urgent else 0), now
         time.sleep(0.005)
     return total

@@ -127,7 +127,7 @@ def final_death_s(folder: Path, *, seen: bool) -> float:
 
 def test_init_has_no_priority_of_a_dead_guard(tmp_path: Path) -> None:
     """A guard lends init its own for a moment, and may be killed just then."""
-    lent = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+    lent = os.SCHED_RR | os.SCHED_RESET_ON_FORK
     with Victim("idle 1 1", tmp_path) as victim:
         os.sched_setscheduler(victim.pid, lent, os.sched_param(1))
         assert os.sched_getscheduler(victim.pid) == lent

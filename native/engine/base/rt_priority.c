@@ -42,7 +42,7 @@ static void count_from_now(void)
 
 void rt_priority_begin(void)
 {
-	const struct sched_param lowest = { .sched_priority = sched_get_priority_min(SCHED_FIFO) };
+	const struct sched_param lowest = { .sched_priority = sched_get_priority_min(SCHED_RR) };
 
 	if (before.depth++)
 		return;
@@ -52,7 +52,7 @@ void rt_priority_begin(void)
 	 * without real-time budget, the guard keeps its priority, and is slower. */
 	before.changed = before.policy != SCHED_FIFO && before.policy != SCHED_RR &&
 			 before.policy != SCHED_DEADLINE && sched_getparam(0, &before.param) == 0 &&
-			 sched_setscheduler(0, SCHED_FIFO, &lowest) == 0;
+			 sched_setscheduler(0, SCHED_RR, &lowest) == 0;
 }
 
 void rt_priority_end(void)
@@ -82,10 +82,10 @@ void rt_priority_step(void)
 
 bool rt_priority_lend(pid_t pid)
 {
-	const struct sched_param lowest = { .sched_priority = sched_get_priority_min(SCHED_FIFO) };
+	const struct sched_param lowest = { .sched_priority = sched_get_priority_min(SCHED_RR) };
 
 	return pid > 0 && sched_getscheduler(pid) == SCHED_OTHER &&
-	       sched_setscheduler(pid, SCHED_FIFO | SCHED_RESET_ON_FORK, &lowest) == 0;
+	       sched_setscheduler(pid, SCHED_RR | SCHED_RESET_ON_FORK, &lowest) == 0;
 }
 
 /* If it still has that policy. */
@@ -99,7 +99,7 @@ static void take_back(pid_t pid, int policy)
 
 void rt_priority_reclaim(pid_t pid)
 {
-	take_back(pid, SCHED_FIFO | SCHED_RESET_ON_FORK);
+	take_back(pid, SCHED_RR | SCHED_RESET_ON_FORK);
 }
 
 void rt_priority_begin_lent(void)
@@ -119,7 +119,7 @@ bool rt_priority_is(void)
 
 void rt_priority_unshare(pid_t tid)
 {
-	take_back(tid, SCHED_FIFO);
+	take_back(tid, SCHED_RR);
 }
 
 void rt_priority_share(pid_t tid)

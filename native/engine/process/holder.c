@@ -21,7 +21,7 @@ static int make_holder(struct process *process, pid_t holder, struct avc_error *
 
 	/* It clones while the whole app is stopped.  Best effort; not for its clones. */
 	if (process->descendant)
-		(void)sched_setscheduler(holder, SCHED_FIFO | SCHED_RESET_ON_FORK, &first);
+		(void)sched_setscheduler(holder, SCHED_RR | SCHED_RESET_ON_FORK, &first);
 	memcpy(own->out, "avckpt-hold", 12);
 	call_begin(own, INJ_AFTER_PARK);
 	/* Leaves the app's session and process group, which a process of the app may lead: their

@@ -178,7 +178,7 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 	    seccomp_supervise(porter->tid, 0, options, porter->cave, ARCH_STUB_BYTES))
 		return fail_errno(err, porter->tid, "infect", "ptrace(SETOPTIONS)", "it has ended");
 	/* The main thread waits for it, and each of its calls takes two wake-ups.  Best effort. */
-	(void)sched_setscheduler(porter->tid, SCHED_FIFO, &first);
+	(void)sched_setscheduler(porter->tid, SCHED_RR, &first);
 	return 0;
 }
 

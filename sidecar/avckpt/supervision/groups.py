@@ -97,7 +97,7 @@ def pause_s(interval_s: float, without_s: float | None) -> float:
 
 def end_haste() -> None:
     """A guard whose application waits for its group gives this process real-time priority (guard_group.c)."""
-    if os.sched_getscheduler(0) == os.SCHED_FIFO | os.SCHED_RESET_ON_FORK:
+    if os.sched_getscheduler(0) == os.SCHED_RR | os.SCHED_RESET_ON_FORK:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
