@@ -17,7 +17,7 @@
 	BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, (nr), 0, 1), \
 		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW)
 
-/* What a filter has to allow for its application to be protected (native/engine/trace/seccomp.c). */
+/* What a filter has to allow for its application to be protected (native/engine/trace/seccomp_calls.c). */
 #define ALLOW_HOMEWARD                                                                             \
 	ALLOW(SYS_rt_sigprocmask), ALLOW(SYS_rt_sigreturn), ALLOW(SYS_munmap), ALLOW(SYS_madvise), \
 		ALLOW(SYS_exit)

@@ -1,11 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
  * Restoring a process that has put itself under a seccomp filter: the calls that restore it would be
- * denied.  So it stays traced and is supervised (seccomp.c) until
- * all is ready; its own first call without us is rt_sigreturn(2).  The code and lists that it
- * executes until then are in the parasite, where the app could have written anything: it cannot
- * make more calls than injected code may.  That holds for one that has yet to install its filters
- * (filters.c), too, and none of its threads runs that is not under its own.
+ * denied.  So it stays traced and is supervised (seccomp_supervise.c) until all is ready; its own
+ * first call without us is rt_sigreturn(2).  The code and lists that it executes until then are in the
+ * parasite, where the app could have written anything: it cannot make more calls than injected code
+ * may.  That holds for one that has yet to install its filters (filters.c), too, and none of its
+ * threads runs that is not under its own.
  */
 #include <errno.h>
 #include <sched.h>

@@ -7,7 +7,7 @@
  *   rewind.c        interrupted system calls
  *   cut.c           ... that have done a part
  *   parasite.c      the parasite as the engine sees it, code run in a process
- *   seccomp.c       ... despite the app's seccomp filters
+ *   seccomp.c       ... despite the app's seccomp filters (seccomp.h)
  *   setup.c         lists of calls that a restored process makes
  *   syscall_batch.c calls of a process that is being created
  *   fd_channel.c    ... and descriptors for it
@@ -470,6 +470,9 @@ bool seccomp_is_containers(const struct proc_status *status, uint32_t containers
 bool seccomp_bars_restart(struct process *process, pid_t tid);
 /* Whether one looks at more than the number of a call that was cut short (cut.c). */
 bool seccomp_bars_rest(struct process *process, pid_t tid);
+
+/* ---- seccomp_supervise.c ---------------------------------------------------------- */
+
 /* From now on, until seccomp_end_supervision(): `options` are its other ptrace options, `inside` is
  * the PID of its process in its own namespace, `code` and `bytes` are where injected code is. */
 int seccomp_supervise(pid_t tid, pid_t inside, long options, avc_remote code,
