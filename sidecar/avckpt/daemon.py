@@ -80,6 +80,9 @@ GUARD_LOOK_S = 1.0
 """Seconds between checks whether guards are alive."""
 GUARD_PATIENCE_S = 5.0
 """A guard that gives no sign of life for this long is killed and replaced."""
+EVENTS_AT_ONCE = 64
+EVENTS_QUEUED = 4096
+"""QUEUE_MAX of native/guard/client.c."""
 GUARD_AGAIN_S = 30.0
 """A guard that is lost sooner than this after the previous one is replaced at the next scan, not at once."""
 
@@ -531,8 +534,9 @@ class Daemon:
     def _app_pids(self) -> set[int]:
         return {watch.container.app_pid for watch in self._watches.values()}
 
-    def _take_events(self) -> None:
-        while (event := self._engine.next_event()) is not None:
+    def _take_events(self, most: int = EVENTS_AT_ONCE) -> None:
+        """Of guards.  They can come faster than they are dealt with: what else there is to do comes in between."""
+        for event in itertools.islice(iter(self._engine.next_event, None), most):
             watch = self._watches.get(event.cookie)
             if watch is None:
                 continue  # the last events of a guard that has been stopped
@@ -640,7 +644,7 @@ class Daemon:
         container = watch.container
         if watch.guard is not None:
             await self._stop(watch.guard)
-            self._take_events()  # it may have reported how the container ended
+            self._take_events(EVENTS_QUEUED)  # it may have reported how the container ended
         ended = has_ended(watch.pidfd)
         os.close(watch.pidfd)
         if watch.connection is not None:

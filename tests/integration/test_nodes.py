@@ -211,6 +211,51 @@ def test_whoever_makes_namespaces_has_no_more_room_by_it(local: LocalSidecar, st
         row(local, "host/counter-3", state="protected")
 
 
+LIAR = """
+import fcntl, os, socket, struct, subprocess, sys, time
+report, write_end = os.pipe()
+verdict, _ = os.pipe()
+app = subprocess.Popen(["sleep", "1000"])
+page = struct.pack("<QIiiiiIIxxxxQiiixxxx", int.from_bytes(b"CKPTCTL1", "little"), 1, os.getpid(), app.pid,
+                   report, verdict, 2000, 0, 0, 0, 1, 0)
+ctl = os.memfd_create("avckpt-ctl", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+os.write(ctl, page)
+fcntl.fcntl(ctl, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
+connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+connection.connect(sys.argv[1])
+rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, struct.pack("i", os.pidfd_open(os.getpid())))]
+connection.sendmsg([b"avckpt-unit 1\\0name=liar\\0label=avckpt.interval=100ms\\0"], rights)
+assert connection.recv(1000) == b"ok"
+os.set_blocking(write_end, False)
+deadline = time.monotonic() + 5
+seq = 0
+while time.monotonic() < deadline:
+    try:  # asked to stop, and ended with status 0
+        os.write(write_end, struct.pack("<IIiiIIQ", 1, seq, app.pid, 0, 1, 0, time.monotonic_ns()))
+        seq += 1
+    except BlockingIOError:
+        time.sleep(0.001)
+print(seq)
+app.kill()
+"""
+
+
+@SHARED
+def test_who_reports_deaths_all_the_time_is_heard_once(local: LocalSidecar, start: Any) -> None:
+    """An avckpt-init of the application's own.  What the sidecar does for others does not wait for it."""
+    start("--name", "counter", *QUICK, "--", *COUNT)
+    row(local, "host/counter", state="protected")
+    socket_path = str(local.run_dir / "units" / "units.sock")
+    with subprocess.Popen([sys.executable, "-c", LIAR, socket_path], stdout=subprocess.PIPE, text=True) as liar:
+        wait_until(lambda: "host/liar: died" in local.log, 10, "its first lie is heard")
+        for restores in (1, 2, 3):
+            wait_until(lambda: row(local, "host/counter")["generations"] == 2, 10, "two generations")
+            os.kill(row(local, "host/counter")["app_pid"], signal.SIGSEGV)
+            row(local, "host/counter", restores=restores, state="protected")
+        assert int(liar.communicate()[0]) > 100
+    assert local.log.count("host/liar: died") == 1
+
+
 LINGERING = """
 import os, socket, struct, sys
 

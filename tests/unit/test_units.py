@@ -75,6 +75,8 @@ def test_a_nodes_labels_are_over_its_containers() -> None:
         ({"avckpt.group": "other"}, {}, "avckpt.group: it is for whoever starts the container"),
         ({"avckpt.interval": "20ms"}, {}, "less than 100ms only if its container's labels do"),
         ({"avckpt.shm": "1GB"}, {}, "avckpt.shm: more than the container was given"),
+        ({"avckpt.restore.max": "6/60s"}, {}, "avckpt.restore.max: more often than the container was given"),
+        ({"avckpt.restore.max": "2/1s"}, {"avckpt.restore.max": "60/60s"}, "more often than the container"),
         ({"avckpt.restore.on": "unhealthy"}, {}, "takes a container's health check"),
         ({"avckpt.enable": "false"}, {}, "avckpt.enable is not true"),
         ({"avckpt.kepe": "3"}, {}, "did you mean avckpt.keep"),

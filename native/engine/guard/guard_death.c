@@ -56,7 +56,9 @@ void guard_give_up(struct avc_guard *guard, const struct avc_report *report, enu
 	guard_drop_all(guard);
 	process_unhold(&guard->main);
 	process_close(&guard->main);
-	/* init ends now, and the reason should remain the last event. */
+	/* init ends now, and the reason should remain the last event. One that does not is none of
+	 * ours, and could report deaths as fast as it can write. */
+	close_fd(&guard->channel.report_fd);
 	guard->next_ns = POLICY_NEVER;
 }
 

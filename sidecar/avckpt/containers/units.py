@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from avckpt_hooks.shared.labels import LABELS, SHM_MAX_BYTES, LabelError, parse_policy
+from avckpt_hooks.shared.labels import LABELS, SHM_MAX_BYTES, LabelError, Policy, parse_policy
 from avckpt_hooks.shared.protocol import ProtocolError
 
 from avckpt.bucket import Bucket
@@ -137,9 +137,15 @@ def labels_of_node(claimed: Mapping[str, str], container: Mapping[str, str]) -> 
         raise LabelsWrong("label avckpt.interval: a node may ask for less than 100ms only if its container's labels do")
     if policy.shm_bytes > max(allowed.shm_bytes, plain.shm_bytes) or policy.shm_bytes > SHM_MAX_BYTES:
         raise LabelsWrong("label avckpt.shm: more than the container was given")
+    if _restores_per_s(policy) > max(_restores_per_s(allowed), _restores_per_s(plain)):
+        raise LabelsWrong("label avckpt.restore.max: more often than the container was given")
     if not policy.enable:
         raise LabelsWrong("label avckpt.enable is not true")
     return merged
+
+
+def _restores_per_s(policy: Policy) -> float:
+    return policy.restore_max / policy.restore_window_s
 
 
 def labels_of_host_unit(claimed: Mapping[str, str]) -> dict[str, str]:
