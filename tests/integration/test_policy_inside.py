@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from avckpt.containers.cgroup import groups_of
-from avckpt.errors import TargetGone
+from avckpt.errors import AvckptError, TargetGone
 from avckpt.supervision.inside import OUTPUT_BYTES, Done, _sealed_program, run_inside
 
 from testkit.harness import ROOT, Container, ContainerFactory, Podman, wait_until
@@ -78,6 +78,30 @@ def test_input_output_and_status(container: ContainerFactory, inside: Callable[[
     assert run("sh", "-c", "kill -SEGV $$").status == 139
     assert run("no-such-program").status == 127
     assert run("/etc/passwd").status == 126
+
+
+@SHARED
+def test_output_without_an_end_does_not_keep_us_busy(
+    container: ContainerFactory, inside: Callable[[Container], Run]
+) -> None:
+    run = inside(container("sleep", "1000"))
+    before = time.process_time()
+    done = run("yes", timeout_s=3)
+    assert (done.timed_out, len(done.output)) == (True, OUTPUT_BYTES - 1)
+    assert time.process_time() - before < 0.5
+    assert run("head", "-c", "1000000", "/dev/zero").status == 0
+
+
+def test_more_groups_than_anybody_needs_are_refused() -> None:
+    """A process with CAP_SETGID can give itself 65536, and each would have to be converted."""
+    with subprocess.Popen(["sleep", "1000"], preexec_fn=lambda: os.setgroups(range(1, 60001))) as main:
+        pidfd = os.pidfd_open(main.pid)
+        try:
+            with pytest.raises(AvckptError, match="is in more than 1024 groups"):
+                asyncio.run(run_inside(pidfd, ["true"], timeout_s=1))
+        finally:
+            os.close(pidfd)
+            main.kill()
 
 
 @SHARED

@@ -37,7 +37,11 @@ from avckpt.errors import AvckptError, KernelError, TargetGone
 ENVIRONMENT_BYTES = 1 << 20
 """A process can set the place and length of its environment itself (PR_SET_MM); execve(2) allows 6 MB."""
 OUTPUT_BYTES = 4096
-"""How much of a command's output is kept; the rest is read and discarded."""
+"""How much of a command's output is kept; the rest is read and discarded, ..."""
+OUTPUT_S = 0.01
+"""... a pipe full in this time at most: one that never stops writing must not keep us busy."""
+GROUPS_MOST = 1024
+"""The kernel allows 65536, each of which would have to be converted."""
 GRACE_S = 2.0
 """How long after the timeout the helper itself is killed, which should have killed the command."""
 KILL_S = 0.5
@@ -131,16 +135,29 @@ async def _wait(process: subprocess.Popen[bytes], output: int, timeout_s: float)
     ended = asyncio.Event()
     kept = bytearray()
 
-    def drain() -> None:
+    def drain() -> bool:
+        """Whether there may be more."""
         with contextlib.suppress(BlockingIOError):
             text = os.read(output, 65536)
-            if not text:
-                loop.remove_reader(output)
             kept.extend(text[: OUTPUT_BYTES - len(kept)])
+            return bool(text)
+        return True
+
+    async def drain_all() -> None:
+        more = asyncio.Event()
+        loop.add_reader(output, more.set)
+        try:
+            while await more.wait() and drain():
+                loop.remove_reader(output)
+                await asyncio.sleep(OUTPUT_S)
+                more.clear()
+                loop.add_reader(output, more.set)
+        finally:
+            loop.remove_reader(output)
 
     pidfd = os.pidfd_open(process.pid)
     loop.add_reader(pidfd, ended.set)
-    loop.add_reader(output, drain)
+    draining = loop.create_task(drain_all())
     ending = None
     try:
         await asyncio.wait_for(ended.wait(), timeout_s)
@@ -148,7 +165,8 @@ async def _wait(process: subprocess.Popen[bytes], output: int, timeout_s: float)
         pass
     finally:
         loop.remove_reader(pidfd)
-        loop.remove_reader(output)
+        draining.cancel()
+        loop.remove_reader(output)  # before it is closed
         os.close(pidfd)
         if not ended.is_set():
             # On request, it kills the command's whole process group; if killed itself, only the command dies
@@ -184,9 +202,12 @@ def _credentials(pid: int) -> tuple[str, list[str]]:
     gid = _inside(int(fields["Gid"].split()[1]), gid_map)
     if uid is None or gid is None:
         raise AvckptError("its main process has a user or group that its user namespace does not", pid=pid)
+    all_groups = fields["Groups"].split()
+    if len(all_groups) > GROUPS_MOST:
+        raise AvckptError(f"its main process is in more than {GROUPS_MOST} groups", pid=pid)
     sets = [fields[name] for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb")]
     # A group without an id in there (one kept from the host) cannot be set.
-    groups = [_inside(int(group), gid_map) for group in fields["Groups"].split()]
+    groups = [_inside(int(group), gid_map) for group in all_groups]
     return (
         ":".join([str(uid), str(gid), *sets, fields["NoNewPrivs"]]),
         [str(group) for group in groups if group is not None],
