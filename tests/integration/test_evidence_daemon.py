@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 from avckpt.cli.client import Client
+from avckpt.evidence.crash import FRAMES_MAX
 from avckpt.evidence.deaths import PROCESSES_MAX, RING_PAGES_MAX, THREADS_ALL, Deaths
 
 from testkit.harness import take_checkpoint, wait_until
@@ -92,6 +93,43 @@ def test_what_it_died_of(sidecar: LocalSidecar) -> None:
 
     # The guard keeps nothing that nobody looks at any more.
     wait_until(lambda: len(_holders(victim)) <= 1, 5, "what the dead have left is gone", every_s=0.05)
+
+
+# Crashes below forty calls, in a file and under a name that are as long as can be, and control a terminal.
+DEEP = """
+#include <signal.h>
+#include <unistd.h>
+volatile sig_atomic_t told;
+void odd(int calls);
+__attribute__((noinline)) void even(int calls)
+{
+    while (!calls) {
+        usleep(10000);
+        if (told)
+            *(volatile int *)0 = 1;
+    }
+    odd(calls - 1);
+    __asm__ volatile("");
+}
+__attribute__((noinline)) void odd(int calls) { even(calls); __asm__ volatile(""); }
+void tell(int signum) { told = signum; }
+int main(void) { signal(SIGUSR1, tell); even(40); }
+"""
+
+
+def test_long_names_fill_no_history(sidecar: LocalSidecar, tmp_path: Path) -> None:
+    built = tmp_path / "deep"
+    subprocess.run(
+        ["gcc", "-O0", "-fno-omit-frame-pointer", "-x", "c", "-o", str(built), "-"], input=DEEP.encode(), check=True
+    )
+    program = built.rename(tmp_path / ("\x1b" * 255))
+    run = f"import os; os.execv({os.fsencode(program)!r}, [bytes([0xff]) * 4090])"
+    victim = sidecar.protected("victim", [sys.executable, "-c", run], ON_COMMAND)
+    wait_until(lambda: Path(f"/proc/{victim.app_pid}/exe").readlink() == program, 10, "it is executed")
+    crash = crash_by(sidecar, victim, signal.SIGUSR1)
+    assert len(crash["crash"]["backtrace"].split()) == FRAMES_MAX
+    assert len(json.dumps(crash)) < 10_000
+    assert max(map(len, sidecar.log.splitlines())) < 1000
 
 
 def test_an_exit_has_no_place(sidecar: LocalSidecar) -> None:

@@ -17,6 +17,8 @@ from avckpt.evidence.kernel_log import Fault
 
 FRAMES_MAX = 32
 FRAMES_OF_FINGERPRINT = 3
+MODULE_SHOWN = 80
+"""Characters of a file's name in a place."""
 
 _CODES = {
     "SIGILL": ("ILL_ILLOPC", "ILL_ILLOPN", "ILL_ILLADR", "ILL_ILLTRP", "ILL_PRVOPC", "ILL_PRVREG", "ILL_COPROC"),
@@ -48,7 +50,7 @@ class Frame:
     build_id: str = ""
 
     def __str__(self) -> str:
-        name = self.module.rpartition("/")[2]
+        name = self.module.rpartition("/")[2][:MODULE_SHOWN]
         return f"{name}+{self.offset:#x}" if self.offset else name or f"{self.address:#x}"
 
 

@@ -24,6 +24,9 @@ MAPS_MAX = 32 << 20
 HEADERS_MAX = 64
 NOTES_MAX = 4096
 STACK_MAX = 32 << 10
+PATH_MOST = 1000
+COMMAND_MOST = 200
+"""Characters, of which it may take six to show one: they are in each event."""
 
 _LINE = re.compile(rb"([0-9a-f]+)-([0-9a-f]+) (\S{4}) ([0-9a-f]+) (\S+) (\d+) *(.*)")
 _INTERPRETERS = re.compile(r"(python|ruby|perl|node|nodejs|bash|sh|java|lua|php)[\d.]*")
@@ -163,7 +166,7 @@ def command_of(pid: int, init_pid: int) -> str:
 
     Raises OSError.
     """
-    texts = [printable(word) for word in command_line(pid)[:2]]
+    texts = [printable(word)[:COMMAND_MOST] for word in command_line(pid)[:2]]
     check_parent(pid, init_pid)
     if len(texts) == 2 and _INTERPRETERS.fullmatch(texts[0].rpartition("/")[2]) and not texts[1].startswith("-"):
         return " ".join(texts)
@@ -188,7 +191,7 @@ def parse_maps(text: bytes) -> list[Mapping]:
     for line in text.split(b"\n"):
         found = _LINE.fullmatch(line)
         if found is not None:
-            path = printable(found[7].decode("utf-8", "replace"))
+            path = printable(found[7].decode("utf-8", "replace"))[:PATH_MOST]
             mappings.append(
                 Mapping(
                     int(found[1], 16),
