@@ -59,6 +59,8 @@ def test_what_an_application_brings_about_at_will_has_an_end() -> None:
             dataclasses.replace(checkpoint(i), monotonic_s=at_ns / 1e9),
             of_guard(Event(Kind.DROPPED, 1, at_ns=at_ns, generation=i, reason=Reason.EXECUTED)),
             dataclasses.replace(unprotected(f"reason {i}"), monotonic_s=at_ns / 1e9),
+            dataclasses.replace(checkpoint(i), monotonic_s=at_ns / 1e9),
+            missed(100 + i / 10),
         ):
             line = journal.line(record)
             if line is not None and line[0] >= logging.INFO:

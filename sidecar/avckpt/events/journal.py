@@ -90,7 +90,7 @@ class Journal:
     def line(self, record: EventRecord) -> tuple[int, str] | None:
         """A logging level and the text (without the container's name), or None for silence."""
         line = self._line(record)
-        often = record.kind in (Kind.CHECKPOINT, Kind.UNPROTECTED) or (
+        often = record.kind in (Kind.CHECKPOINT, Kind.UNPROTECTED, Kind.MISSED) or (
             record.kind is Kind.DROPPED and record.reason not in (Reason.CRASHED, Reason.UNHEALTHY)
         )
         if line is None or not often or line[0] < logging.INFO:
