@@ -27,6 +27,11 @@ from avckpt.guard import Event
         ),
         (b"6,1,2,-;traps: a b[7] trap divide error ip:40 sp:7f error:0 in a[1000+1]", (7, Fault("a b", None))),
         (b"6,1,2,-;traps: PLC[x[9] general protection fault ip:1 sp:2 error:0", (9, Fault("PLC[x", None))),
+        # Names that look like a number that is another thread's, and names of which the kernel escapes each byte.
+        (b"6,1,2,-;traps: evil[7] b[2997] trap invalid opcode ip:1 sp:2 error:0", (2997, Fault("evil[7] b", None))),
+        (b"6,1,2,-;traps: x[7] trap y[9] trap int3 ip:1 sp:2 error:0 in z[8] [1,2+3]", (9, Fault("x[7] trap y", None))),
+        (b"6,1,2,-;" + b"\\x1b" * 15 + b"[9]: segfault at 0 ip 1", (9, Fault("\x1b" * 15, 0))),
+        (b"6,1,2,-;\\xc3\\xa9\\x5c[9]: segfault at 0 ip 1", (9, Fault("é\\", 0))),
         # Anybody who may write to the log: not the kernel's facility.
         (b"12,1,2,-;die[1]: segfault at 0 ip 1", None),
         (b"6,1,2,-;name that is too long for a task[1]: segfault at 0 ip 1", None),

@@ -100,7 +100,8 @@ class Collector:
             return Case(pid, wait_status, crash, Death(), None, *kept)
         death = self._deaths.of(pid)
         hit = death.fatal(signum) if signum else None
-        fault = self._log.of(hit.tid) if hit is not None and self._log is not None else None
+        # A signal that was sent has none: what the log has of that number is of an earlier thread.
+        fault = self._log.of(hit.tid) if hit is not None and hit.code > 0 and self._log is not None else None
         crash = crash_of(name, hit, death, fault)
         if crash.sender_pid:
             crash = replace(crash, sender=_name_of(crash.sender_pid))

@@ -16,8 +16,10 @@ FAULTS_MAX = 256
 LINES_MAX = 5000
 """Read at once; of a log that grows faster than that the rest is skipped."""
 
-_FAULT = re.compile(r"(.{0,15}?)\[(\d{1,10})\]: segfault at ([0-9a-f]{1,16}) ip ")
-_TRAP = re.compile(r"traps: (.{0,15}?)\[(\d{1,10})\] ")
+# 15 bytes at most, of which the kernel escapes some.  As many as fit: a name may look like a shorter one with a number.
+_NAME = r"((?:[^\\]|\\x[0-9a-f]{2}){0,15})"
+_FAULT = re.compile(_NAME + r"\[(\d{1,10})\]: segfault at ([0-9a-f]{1,16}) ip ")
+_TRAP = re.compile("traps: " + _NAME + r"\[(\d{1,10})\] ")
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,11 @@ def fault_of(line: bytes) -> tuple[int, Fault] | None:
         return None  # not the kernel: somebody has written it there
     found = _FAULT.match(text)
     if found is not None:
-        return int(found[2]), Fault(found[1], int(found[3], 16))
+        return int(found[2]), Fault(_name(found[1]), int(found[3], 16))
     found = _TRAP.match(text)
-    return None if found is None else (int(found[2]), Fault(found[1], None))
+    return None if found is None else (int(found[2]), Fault(_name(found[1]), None))
+
+
+def _name(escaped: str) -> str:
+    plain = re.sub(r"\\x([0-9a-f]{2})", lambda each: chr(int(each[1], 16)), escaped)
+    return plain.encode("latin-1", "replace").decode("utf-8", "replace")
