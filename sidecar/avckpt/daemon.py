@@ -389,10 +389,12 @@ class Daemon:
             if peer.uid != 0 or not units.is_of_host(peer.pid):
                 raise Denied("its container was not started with avckpt.scope=nodes, and of the host only root may")
             owner = prefix = units.HOST
-            labels, allowance = units.labels_of_host_unit(claim.labels), self._host_units
+            self._host_units.take()
+            labels = units.labels_of_host_unit(claim.labels)
         else:
             owner, prefix = launcher.container.id, launcher.container.label
-            labels, allowance = units.labels_of_node(claim.labels, launcher.labels), launcher.units
+            launcher.units.take()
+            labels = units.labels_of_node(claim.labels, launcher.labels)
         inits = {each.container.init_pid: each for each in self._watches.values() if each.guard is not None}
         for pid in units.ancestors(peer.pid):
             if pid in inits:
@@ -400,7 +402,6 @@ class Daemon:
         unit = units.unit_id(owner, peer.pid)
         if has_ended(peer.pidfd):
             raise TargetGone("it has ended already")  # then what was read may belong to another process
-        allowance.take()
         if self._live_run(unit) is None:
             siblings = [each.name for each in self.registry.live() if each.node_of == owner]
             if len(siblings) >= units.UNITS_MOST:

@@ -170,6 +170,28 @@ while refused < 2000:
 """
 
 
+CLAIMS = """
+import os, socket, struct, sys
+rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, struct.pack("i", os.pidfd_open(os.getpid())))]
+answers = set()
+for _ in range(200):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+        connection.connect(sys.argv[1])
+        connection.sendmsg([b"avckpt-unit 1\\0name=a\\0label=avckpt.kepe=1\\0"], rights)
+        answers.add(connection.recv(1000).decode())
+print(sorted(answers))
+"""
+
+
+@SHARED
+def test_labels_of_a_node_are_read_as_often_as_it_may_register(local: LocalSidecar) -> None:
+    """What reading them takes is up to the node."""
+    path = str(local.run_dir / "units" / "units.sock")
+    said = run([sys.executable, "-c", CLAIMS, path], timeout_s=60).stdout
+    assert "no label avckpt.kepe: unknown label" in said
+    assert "later too many units were started in too short a time" in said
+
+
 @SHARED
 def test_requests_of_anybody_fill_no_log(local: LocalSidecar, start: Any) -> None:
     """Nor do they keep others out."""

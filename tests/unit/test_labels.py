@@ -167,6 +167,8 @@ def test_the_rest_of_the_table() -> None:
         ("notify", "signal:RTMAX+1", "RTMAX+1 is no signal"),
         ("notify.self", "signal:KILL", "cannot be caught"),
         ("notify.self", "exec:echo 'a", "a quotation that does not end"),
+        ("notify.self", "exec:echo " + "a" * 2048, "longer than 2048 characters"),
+        ("restore.on", "signal," * 400 + "exit", "longer than 2048 characters"),
     ],
 )
 @pytest.mark.parametrize("enable", ["true", "false"])

@@ -29,6 +29,8 @@ KEEP_MAX = 16
 RESTORES_MAX = 64
 """AVC_RESTORES_MAX of the engine: the number that it remembers."""
 
+VALUE_MAX = 2048
+"""Characters.  The sidecar takes microseconds for each character of a command, and does nothing else meanwhile."""
 SHM_MAX_BYTES = 1_000_000_000
 AUTOMATIC_MAX = "3s"
 """The longest time between two checkpoints at avckpt.interval=auto, and the default where that cannot be."""
@@ -157,6 +159,8 @@ def parse_policy(mapping: Mapping[str, str]) -> Policy:
         if label is None:
             raise _unknown(key)
         try:
+            if len(value) > VALUE_MAX:
+                raise ValueError(f"longer than {VALUE_MAX} characters")
             fields.update(label.parse(value))
         except ValueError as error:
             raise LabelError(key, value, str(error), "allowed: " + label.allowed) from None
