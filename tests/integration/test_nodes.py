@@ -270,7 +270,7 @@ def test_who_reports_deaths_all_the_time_is_heard_once(local: LocalSidecar, star
     socket_path = str(local.run_dir / "units" / "units.sock")
     with subprocess.Popen([sys.executable, "-c", LIAR, socket_path], stdout=subprocess.PIPE, text=True) as liar:
         wait_until(lambda: "host/liar: died" in local.log, 10, "its first lie is heard")
-        for restores in (1, 2, 3):
+        for restores in (1, 2):  # a third time would be a loop
             wait_until(lambda: row(local, "host/counter")["generations"] == 2, 10, "two generations")
             os.kill(row(local, "host/counter")["app_pid"], signal.SIGSEGV)
             row(local, "host/counter", restores=restores, state="protected")
