@@ -86,7 +86,7 @@ def wait_counter(victim: Victim, which: int, value: int) -> None:
     victim.check()
 
 
-@pytest.mark.parametrize("command", [*STATIC, *CHANGING, "terminal --stopped", "tree 9 --orphan"])
+@pytest.mark.parametrize("command", [*STATIC, *CHANGING, "terminal --stopped", "terminal --heard", "tree 9 --orphan"])
 def test_nobody_sees_checkpoints(command: str, tmp_path: Path) -> None:
     """Every few milliseconds, also in the middle of fork, exec, vfork and exit."""
     with Victim(command, tmp_path) as victim, GuardProcess(steady(0.005), [victim.pid]) as guard:
@@ -118,8 +118,10 @@ def test_killed_at_random_moments(command: str, tmp_path: Path) -> None:
         kill_again_and_again(guard, victim, KILLS, 0.15)
 
 
-def test_a_stopped_job_is_stopped_again(tmp_path: Path) -> None:
-    with Victim("terminal --stopped", tmp_path) as victim, GuardProcess(steady(0.05), [victim.pid]) as guard:
+@pytest.mark.parametrize("which", ["stopped", "heard"])
+def test_a_stopped_job_is_stopped_again(which: str, tmp_path: Path) -> None:
+    """Its parent waits for it, or has done so and cannot do it again."""
+    with Victim(f"terminal --{which}", tmp_path) as victim, GuardProcess(steady(0.05), [victim.pid]) as guard:
         kill_again_and_again(guard, victim, KILLS, 0.15)
 
 

@@ -39,6 +39,7 @@ CONTENT = [
     "prefork 2 1 --private 10",
     "terminal",
     "terminal --stopped",
+    "terminal --heard",
 ]
 
 

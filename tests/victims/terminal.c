@@ -1,12 +1,13 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * terminal [--stopped]: a shell with jobs on a terminal of its own.
+ * terminal [--stopped|--heard]: a shell with jobs on a terminal of its own.
  *
  * The main process holds the other side of a pseudo-terminal, on which a session's
  * leader has two jobs, each a process group of two.  Now and then the leader puts
  * the other job into the foreground, and everybody sees where it is: what the
  * leader has noted in shared memory is what the terminal says.  --stopped: a third
- * job is stopped, as by ^Z; its parent sees that, and nobody continues it.
+ * job is stopped, as by ^Z; its parent sees that, and nobody continues it.  --heard: the parent
+ * has waited for it, which it can do only once; so has the job, of a child that stopped before it.
  * Counter 0: changes of the foreground.
  */
 #include <sys/ioctl.h>
@@ -15,10 +16,11 @@
 #include "family.h"
 
 enum { JOBS = 2, STUCK_LAPS = 10000 };
+enum extra { NONE, STOPPED, HEARD };
 
 static struct shared {
 	pthread_mutex_t lock;
-	pid_t job[JOBS], leader;
+	pid_t job[JOBS], leader, below;
 	volatile uint64_t changes; /* the job in front is this one modulo JOBS */
 	volatile uint64_t laps[JOBS * 2 + 1];
 } * shared;
@@ -112,6 +114,69 @@ static void check_stopped(pid_t pid)
 			   info.si_code, info.si_status);
 }
 
+/* Field 52 of its stat: the signal of a stop that its parent has not waited for. */
+static void check_heard(pid_t pid)
+{
+	char path[32], text[512] = "", *last;
+	FILE *file;
+
+	snprintf(path, sizeof(path), "/proc/%d/stat", pid);
+	file = fopen(path, "re");
+	if (!file || !fgets(text, sizeof(text), file))
+		came_apart("%s: %s", path, strerror(errno));
+	fclose(file);
+	last = strrchr(text, ' ');
+	if (!last || atoi(last + 1))
+		came_apart("a stop would be reported again: %s", text);
+}
+
+static void *rest(void *arg)
+{
+	for (;;)
+		pause();
+	return arg;
+}
+
+static void await_stop(pid_t pid)
+{
+	siginfo_t info;
+
+	must(pid >= 0, "fork");
+	add_child(pid);
+	must(waitid(P_PID, (id_t)pid, &info, WSTOPPED) == 0, "waitid");
+}
+
+static _Noreturn void stay_stopped(pid_t parent)
+{
+	for (;;) {
+		raise(SIGSTOP);
+		if (getppid() != parent)
+			_exit(0);
+		violation("somebody has continued what is stopped");
+	}
+}
+
+static void start_heard(pid_t stopped[2])
+{
+	pthread_t thread;
+
+	stopped[0] = fork();
+	if (stopped[0] == 0) {
+		const pid_t job = getpid();
+
+		forget_children();
+		setpgid(0, 0);
+		must(!pthread_create(&thread, NULL, rest, NULL), "pthread_create");
+		shared->below = fork();
+		if (shared->below == 0)
+			stay_stopped(job);
+		await_stop(shared->below);
+		stay_stopped(shared->leader);
+	}
+	await_stop(stopped[0]);
+	stopped[1] = shared->below;
+}
+
 static void change_foreground(uint64_t to)
 {
 	must(!pthread_mutex_lock(&shared->lock), "lock");
@@ -121,9 +186,9 @@ static void change_foreground(uint64_t to)
 	count(0, 1);
 }
 
-static _Noreturn void lead(const char *path, bool with_stopped)
+static _Noreturn void lead(const char *path, enum extra extra)
 {
-	pid_t stopped = 0;
+	pid_t stopped = 0, heard[2] = { 0 };
 	uint64_t laps;
 	int i;
 
@@ -136,8 +201,12 @@ static _Noreturn void lead(const char *path, bool with_stopped)
 	shared->leader = getpid();
 	for (i = 0; i < JOBS; i++)
 		start_job(i);
-	if (with_stopped)
+	if (extra == STOPPED)
 		stopped = start_stopped();
+	if (extra == HEARD) {
+		start_heard(heard);
+		watch_sigchld();
+	}
 	change_foreground(1);
 	for (laps = 1;; laps++) {
 		check_place();
@@ -148,6 +217,8 @@ static _Noreturn void lead(const char *path, bool with_stopped)
 			check_stopped(stopped);
 		else
 			check_nothing_to_wait_for();
+		for (i = 0; i < 2 && heard[i]; i++)
+			check_heard(heard[i]);
 		check_children_file();
 		shared->laps[JOBS * 2]++;
 		nap(1000);
@@ -156,14 +227,16 @@ static _Noreturn void lead(const char *path, bool with_stopped)
 
 int main(int argc, char **argv)
 {
-	const bool with_stopped = victim_flag(&argc, argv, "--stopped");
+	const enum extra extra = victim_flag(&argc, argv, "--stopped") ? STOPPED
+				 : victim_flag(&argc, argv, "--heard") ? HEARD
+								       : NONE;
 	uint64_t seen[JOBS * 2 + 1] = { 0 }, ticks[JOBS * 2 + 1] = { 0 };
 	pthread_mutexattr_t attr;
 	char path[64];
 	int master, i;
 	pid_t pid;
 
-	victim_start(&argc, argv, 0, "[--stopped]");
+	victim_start(&argc, argv, 0, "[--stopped|--heard]");
 	shared = mmap(NULL, sizeof(*shared), PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1,
 		      0);
 	must(shared != MAP_FAILED, "mmap");
@@ -177,7 +250,7 @@ int main(int argc, char **argv)
 	must(ptsname_r(master, path, sizeof(path)) == 0, "ptsname_r");
 	pid = fork();
 	if (pid == 0)
-		lead(path, with_stopped);
+		lead(path, extra);
 	add_child(pid);
 	watch_sigchld();
 	for (i = 0; i <= JOBS * 2; i++)

@@ -177,6 +177,7 @@ static int fill_slot(struct image *image, struct avc_error *err)
 			    "its seccomp filters have just changed");
 	image->headless = process->pid != process->leader;
 	image->stop_signal = main_thread->stop_signal;
+	image->stop_heard = process->stop_heard;
 	setup_begin(&setup, parasite, image->slot);
 	if (filters_setup(image, main_thread, &setup, err))
 		return -1;

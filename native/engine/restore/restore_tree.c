@@ -418,6 +418,47 @@ static int flush_signals(struct forked *parent, struct avc_error *err)
 	return 0;
 }
 
+/* As job control does: it stays so when it is released, whatever it does for us until then. */
+static int stop_again(pid_t pid, struct avc_error *err)
+{
+	struct stop stop = { .kind = STOP_NONE };
+
+	tracee_signal(pid, SIGSTOP);
+	while (stop.kind != STOP_GROUP) {
+		if (seccomp_go_on(pid, &stop))
+			return fail_errno(err, pid, "restore", "ptrace(CONT)", "it was killed");
+		stop = tracee_wait(pid, 0);
+		if (stop.kind == STOP_EXIT || stop.kind == STOP_DYING)
+			return fail(err, AVC_GONE, 0, pid, "restore", "", "it was killed");
+		if (stop.kind == STOP_DEADLINE)
+			return fail(err, AVC_DEADLINE, 0, pid, "restore", "",
+				    "it did not stop again");
+	}
+	return 0;
+}
+
+/* Stops what was stopped and waited for, and has the parents wait for it once more: a shell would take
+ * it for a new stop. */
+static int hear_stops(struct restore_tree *restored, struct avc_error *err)
+{
+	for (uint32_t i = 1; i < restored->generation->images; i++) {
+		const struct image *image = &restored->generation->image[i];
+		struct forked *parent;
+
+		if (!image->process || !image->stop_heard || image->parent == PARENT_INIT)
+			continue;
+		parent = &restored->forked[image->parent];
+		if (stop_again(restored->forked[i].pid, err))
+			return -1;
+		restore_fork_note(parent, SIGCHLD);
+		syscall_batch_add(&parent->batch, SYS_waitid, P_PID, (uint64_t)image->inside, 0,
+				  WSTOPPED | WNOHANG, 0);
+		if (syscall_batch_flush(&parent->batch, err))
+			return -1;
+	}
+	return 0;
+}
+
 /* Session and group before it has children; a descendant gets them in become(). */
 static int begin_main(struct restore_tree *restored, struct avc_error *err)
 {
@@ -477,6 +518,8 @@ static int join_up(struct restore_tree *restored, struct avc_error *err)
 				   err))
 			return -1;
 	}
+	if (hear_stops(restored, err))
+		return -1;
 	for (uint32_t i = 0; i < generation->images; i++)
 		if (restored->forked[i].flush && generation->image[i].process &&
 		    flush_signals(&restored->forked[i], err))

@@ -6,10 +6,12 @@
  */
 #include <errno.h>
 #include <signal.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/ptrace.h>
 #include <sys/syscall.h>
+#include <sys/utsname.h>
 
 #include "state.h"
 
@@ -104,6 +106,29 @@ bool signal_ends_by_default(int signal)
 	       signal != SIGSTOP && signal != SIGTSTP && signal != SIGTTIN && signal != SIGTTOU;
 }
 
+/* Since Linux 5.17 /proc/PID/stat has the signal of a stop until the parent has waited for it, then 0
+ * (fs/proc/array.c, group_exit_code); 0 before all threads have joined the stop, too. */
+static bool tells_stops(void)
+{
+	int major = 0, minor = 0;
+	struct utsname name;
+
+	return uname(&name) == 0 && sscanf(name.release, "%d.%d", &major, &minor) == 2 &&
+	       (major > 5 || (major == 5 && minor >= 17));
+}
+
+static bool is_stop_heard(const struct process *process)
+{
+	struct proc_stat stat;
+
+	if (!tells_stops())
+		return false;
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		if (process->threads[i].block >= 0 && !process->threads[i].stop_signal)
+			return false;
+	return proc_stat(process->pid, &stat) == 0 && !stat.exit_status;
+}
+
 /* A process that has got a fatal signal and was stopped by us before it could die of it, or run its
  * crash handler: every restore of such an image would die at once. */
 static int find_deadly(const struct process *process, const struct proc_status *status)
@@ -136,6 +161,8 @@ int pending_read(struct process *process, struct avc_error *err)
 	pending->deadly = 0;
 	pending->caught = false;
 	pending->too_many = false;
+	process->stop_heard = thread_find(process, process->pid)->stop_signal &&
+			      is_stop_heard(process);
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		struct thread *t = &process->threads[i];
 

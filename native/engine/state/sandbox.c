@@ -232,7 +232,8 @@ void sandbox_go(struct sandbox *sandbox)
 	for (uint32_t i = 0; image->stop_signal && i < sandbox->count; i++)
 		if (filters_seal_of(image, sandbox->tid[i]))
 			bring_home(sandbox->tid[i]);
-	if (image->stop_signal)
+	/* One whose parent has heard of it is in that stop already (restore_tree.c). */
+	if (image->stop_signal && !image->stop_heard)
 		tracee_signal(sandbox->pid, image->stop_signal);
 	slot->running = slot->threads;
 	if (image->headless) { /* the others regard it as exited */

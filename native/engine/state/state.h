@@ -53,6 +53,7 @@ struct image {
 	bool adopts;             /* struct process; then                              */
 	bool headless;           /* its main thread had ended                       */
 	int stop_signal;         /* stopped by that (job control), 0: it was not     */
+	bool stop_heard;         /* struct process                                   */
 	int64_t dumpable;        /* prctl(2), PR_GET_DUMPABLE                        */
 	struct attributes *attributes;
 	struct process_attrs *attrs;  /* of one to be forked by its parent */

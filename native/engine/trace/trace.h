@@ -234,6 +234,7 @@ struct process {
 	int sockets[SOCKETS_MAX];
 	uint32_t socket_count;
 	struct pending *pending;
+	bool stop_heard; /* stopped by job control, and its parent has waited for that */
 	struct timers *timers;
 	struct memory *memory;
 	struct mem_others *others; /* of the main one, and so of all             */
