@@ -21,7 +21,7 @@ import pytest
 from avckpt.guard import GuardConfig
 
 from testkit.family import kill_main, look, main_process, members, ours, places, progress, wait_whole
-from testkit.guarded import GuardProcess, Victim, config, forks_beside, meanwhile, storm
+from testkit.guarded import GuardProcess, Victim, config, forks_beside, meanwhile, since_linux, storm
 from testkit.harness import wait_until
 from testkit.procfs import children_of, figures, status_of
 from testkit.scenario import checkpoint
@@ -118,7 +118,10 @@ def test_killed_at_random_moments(command: str, tmp_path: Path) -> None:
         kill_again_and_again(guard, victim, KILLS, 0.15)
 
 
-@pytest.mark.parametrize("which", ["stopped", "heard"])
+HEARD = pytest.param("heard", marks=since_linux(5, 17, "whether a stop has been waited for"))
+
+
+@pytest.mark.parametrize("which", ["stopped", HEARD])
 def test_a_stopped_job_is_stopped_again(which: str, tmp_path: Path) -> None:
     """Its parent waits for it, or has done so and cannot do it again."""
     with Victim(f"terminal --{which}", tmp_path) as victim, GuardProcess(steady(0.05), [victim.pid]) as guard:

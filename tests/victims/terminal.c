@@ -130,13 +130,6 @@ static void check_heard(pid_t pid)
 		came_apart("a stop would be reported again: %s", text);
 }
 
-static void *rest(void *arg)
-{
-	for (;;)
-		pause();
-	return arg;
-}
-
 static void await_stop(pid_t pid)
 {
 	siginfo_t info;
@@ -158,15 +151,12 @@ static _Noreturn void stay_stopped(pid_t parent)
 
 static void start_heard(pid_t stopped[2])
 {
-	pthread_t thread;
-
 	stopped[0] = fork();
 	if (stopped[0] == 0) {
 		const pid_t job = getpid();
 
 		forget_children();
 		setpgid(0, 0);
-		must(!pthread_create(&thread, NULL, rest, NULL), "pthread_create");
 		shared->below = fork();
 		if (shared->below == 0)
 			stay_stopped(job);

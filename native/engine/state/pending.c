@@ -107,7 +107,7 @@ bool signal_ends_by_default(int signal)
 }
 
 /* Since Linux 5.17 /proc/PID/stat has the signal of a stop until the parent has waited for it, then 0
- * (fs/proc/array.c, group_exit_code); 0 before all threads have joined the stop, too. */
+ * (fs/proc/array.c, group_exit_code). */
 static bool tells_stops(void)
 {
 	int major = 0, minor = 0;
@@ -117,15 +117,13 @@ static bool tells_stops(void)
 	       (major > 5 || (major == 5 && minor >= 17));
 }
 
+/* Not of several threads: the kernel does not expect one to be made in a stop (do_jobctl_trap()). */
 static bool is_stop_heard(const struct process *process)
 {
 	struct proc_stat stat;
 
-	if (!tells_stops())
+	if (!tells_stops() || process->thread_count != 1 || !process->threads[0].stop_signal)
 		return false;
-	for (uint32_t i = 0; i < process->thread_count; i++)
-		if (process->threads[i].block >= 0 && !process->threads[i].stop_signal)
-			return false;
 	return proc_stat(process->pid, &stat) == 0 && !stat.exit_status;
 }
 

@@ -28,6 +28,7 @@ struct sandbox {
 	const struct image *image;
 	pid_t pid, inside;
 	uint32_t count;
+	bool in_stop; /* of job control, when it was halted last */
 	pid_t tid[THREADS_MAX];
 };
 
@@ -143,7 +144,7 @@ static void bring_home(pid_t tid)
 }
 
 /* False: it has exited, or was killed. */
-static bool halt(const struct sandbox *sandbox, pid_t tid)
+static bool halt(struct sandbox *sandbox, pid_t tid)
 {
 	for (;;) {
 		struct stop stop;
@@ -152,8 +153,10 @@ static bool halt(const struct sandbox *sandbox, pid_t tid)
 		if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
 			return false;
 		stop = tracee_wait(tid, 0);
-		if (stop.kind == STOP_TRAP || stop.kind == STOP_GROUP)
+		if (stop.kind == STOP_TRAP || stop.kind == STOP_GROUP) {
+			sandbox->in_stop = stop.kind == STOP_GROUP;
 			return true;
+		}
 		if (is_over(&stop))
 			return false;
 		if (stop.kind == STOP_SYSCALL)
@@ -182,8 +185,7 @@ static void see_off(const struct sandbox *sandbox, pid_t tid)
 
 /* Each is stopped where it waits for `go`, and is to return from there.  One that is none of its
  * threads ends; so does a main thread that had ended, but when all is ready. */
-static int halt_one(const struct sandbox *sandbox, pid_t tid, uint32_t *halted,
-		    struct avc_error *err)
+static int halt_one(struct sandbox *sandbox, pid_t tid, uint32_t *halted, struct avc_error *err)
 {
 	const struct image *image = sandbox->image;
 	const struct parasite *parasite = &image->process->parasite;
@@ -232,8 +234,9 @@ void sandbox_go(struct sandbox *sandbox)
 	for (uint32_t i = 0; image->stop_signal && i < sandbox->count; i++)
 		if (filters_seal_of(image, sandbox->tid[i]))
 			bring_home(sandbox->tid[i]);
-	/* One whose parent has heard of it is in that stop already (restore_tree.c). */
-	if (image->stop_signal && !image->stop_heard)
+	/* One whose parent has heard of it is in that stop already (restore_tree.c), unless somebody has
+	 * continued it since. */
+	if (image->stop_signal && !(image->stop_heard && sandbox->in_stop))
 		tracee_signal(sandbox->pid, image->stop_signal);
 	slot->running = slot->threads;
 	if (image->headless) { /* the others regard it as exited */
