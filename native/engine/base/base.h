@@ -483,7 +483,7 @@ struct page_cursor {
 bool pageset_next(const struct pageset *set, struct page_cursor *at, avc_remote *start,
 		  avc_remote *end);
 uint64_t pageset_count(const struct pageset *set);
-/* Moves this many of the last ones, or a few more. */
+/* Moves this many of the last ones, or a few more, to a set that was empty.  False: none. */
 bool pageset_take(struct pageset *from, uint64_t pages, struct pageset *to);
 void pageset_free(struct pageset *set);
 

@@ -115,25 +115,41 @@ bool pageset_next(const struct pageset *set, struct page_cursor *at, avc_remote 
 	return false;
 }
 
+static uint64_t pages_in(const struct page_chunk *chunk)
+{
+	uint64_t pages = 0;
+
+	for (size_t k = 0; k < sizeof chunk->bits / sizeof *chunk->bits; k++)
+		if (chunk->bits[k]) /* few have any */
+			pages += (uint64_t)__builtin_popcountll(chunk->bits[k]);
+	return pages;
+}
+
 uint64_t pageset_count(const struct pageset *set)
 {
 	uint64_t pages = 0;
 
 	for (uint32_t i = 0; i < set->count; i++)
-		for (size_t k = 0; k < sizeof set->chunk[i].bits / sizeof *set->chunk[i].bits; k++)
-			pages += (uint64_t)__builtin_popcountll(set->chunk[i].bits[k]);
+		pages += pages_in(&set->chunk[i]);
 	return pages;
 }
 
 bool pageset_take(struct pageset *from, uint64_t pages, struct pageset *to)
 {
-	while (from->count && pageset_count(to) < pages) {
-		if (!make_room(&to->chunk, to->count, &to->room, sizeof *to->chunk))
-			return false;
-		memmove(&to->chunk[1], to->chunk, to->count * sizeof *to->chunk);
-		to->chunk[0] = from->chunk[--from->count];
-		to->count++;
+	uint32_t first = from->count, count;
+	uint64_t taken = 0;
+
+	while (first && taken < pages)
+		taken += pages_in(&from->chunk[--first]);
+	count = from->count - first;
+	*to = (struct pageset){ count, count, count ? calloc(count, sizeof *to->chunk) : NULL };
+	if (count && !to->chunk) {
+		*to = (struct pageset){ 0 };
+		return false;
 	}
+	if (count)
+		memcpy(to->chunk, &from->chunk[first], count * sizeof *to->chunk);
+	from->count = first;
 	return true;
 }
 

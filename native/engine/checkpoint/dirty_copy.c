@@ -237,20 +237,30 @@ static int prepare_run(struct template_calls *calls, const struct run *run, int 
 		       : 0;
 }
 
+static int prepare(const struct dirty *dirty, struct template_calls *calls, int pagemap, bool data,
+		   struct avc_error *err)
+{
+	for (uint32_t i = 0; i < dirty->runs; i++)
+		if ((dirty->run[i].kind == RUN_DATA) == data &&
+		    prepare_run(calls, &dirty->run[i], pagemap, err))
+			return -1;
+	return template_calls_end(calls, err);
+}
+
 int copy_write(struct dirty *dirty, struct template_calls *calls, struct avc_error *err)
 {
 	const struct idle_template *idle = &dirty->idle;
 	int mem = proc_open(idle->pid, "mem", O_RDWR);
 	int pagemap = proc_open(idle->pid, "pagemap", O_RDONLY);
-	int result = 0;
+	int result = prepare(dirty, calls, pagemap, false, err);
 
-	for (uint32_t i = 0; !result && i < dirty->runs; i++)
-		result = prepare_run(calls, &dirty->run[i], pagemap, err);
-	if (!result)
-		result = template_calls_end(calls, err);
-	if (!result && (mem < 0 || !move(dirty, idle->pid, mem, false)))
-		result = fail_errno(err, idle->pid, "keep template", "process_vm_writev",
-				    "its memory cannot be written");
+	/* What is to be written needs it only where there are guards, which cannot be written to. */
+	if (!result && !move(dirty, idle->pid, mem, false)) {
+		result = prepare(dirty, calls, pagemap, true, err);
+		if (!result && !move(dirty, idle->pid, mem, false))
+			result = fail_errno(err, idle->pid, "keep template", "process_vm_writev",
+					    "its memory cannot be written");
+	}
 	close_fd(&mem);
 	close_fd(&pagemap);
 	for (uint32_t i = 0; i < dirty->runs; i++)
