@@ -394,7 +394,7 @@ def scrape(local: LocalSidecar) -> dict[str, float]:
 @SHARED
 def test_metrics_of_a_crash(local: LocalSidecar) -> None:
     program = "import time\nx = bytearray(20_000_000)\nwhile 1:\n  x[::4096] = bytes(len(x[::4096])); time.sleep(.05)"
-    web = local.protected("web", ["python3", "-c", program])
+    web = local.protected("web", [sys.executable, "-c", program])
     local.wait_for(web, state="protected")
     crash(local, web)
     local.wait_for(web, generations=2)
@@ -422,7 +422,7 @@ def test_memory_that_several_generations_hold_together_counts_once(local: LocalS
         f"print('ready', flush=True)\nwhile not os.path.exists({str(again)!r}): time.sleep(.02)\n"
         "x[::4096] = b'2' * len(x[::4096])\nprint('written', flush=True)\ntime.sleep(1000)"
     )
-    web = local.protected("web", ["python3", "-c", program], ON_COMMAND)
+    web = local.protected("web", [sys.executable, "-c", program], ON_COMMAND)
     wait_until(lambda: "ready" in web.output.read_text(), 20, "it has its memory")
     for number in (1, 2):
         take_checkpoint(local.client, "web")

@@ -24,7 +24,7 @@ from testkit.protected import build_victims
 SLEEPER = ["sleep", "1000"]
 # Says READY, then a line for every SIGUSR1.
 LISTENER = [
-    "python3",
+    sys.executable,
     "-uc",
     "import signal, time\n"
     "signal.signal(signal.SIGUSR1, lambda *_: print('USR1', flush=True))\n"
@@ -125,7 +125,7 @@ def test_a_blocked_signal_waits_for_who_takes_it(local: LocalSidecar) -> None:
         "import signal\nsignal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1})\n"
         "while True: signal.sigwait({signal.SIGUSR1}); print('USR1', flush=True)"
     )
-    web = local.container("web", ["python3", "-uc", program])
+    web = local.container("web", [sys.executable, "-uc", program])
     app = web.app_pid
     wait_until(lambda: Path(f"/proc/{app}/syscall").read_text().startswith("128 "), 10, "it waits (rt_sigtimedwait)")
     assert web.hook("prestart", {**QUICK, "avckpt.notify.self": "signal:USR1"}) == ""

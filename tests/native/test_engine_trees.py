@@ -246,6 +246,21 @@ def test_killed_in_other_ways(signum: int, tmp_path: Path) -> None:
         assert places(victim) == before
 
 
+def test_none_of_ours_keeps_a_cpu_from_its_equals(tmp_path: Path) -> None:
+    """The kernel spins in /proc until another task of ours has run, which with SCHED_FIFO it never would."""
+    seen = set()
+    with Victim("tree 8", tmp_path) as victim, GuardProcess(steady(0.01), [victim.pid]) as guard:
+        for _ in range(5):
+            checkpoint(guard)
+            since = guard.mark()
+            kill_main(victim)
+            while not [event for event in guard.events[since:] if event["kind"] == "restored"]:
+                for pid in [*guard.guards, victim.pid, *ours(victim, "avckpt-hold")]:
+                    with contextlib.suppress(ProcessLookupError):
+                        seen.add(os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK)
+    assert seen == {os.SCHED_OTHER, os.SCHED_RR}
+
+
 def test_rolled_back_on_command(tmp_path: Path) -> None:
     with Victim("tree 8", tmp_path) as victim, GuardProcess(steady(), [victim.pid]) as guard:
         before = places(victim)
