@@ -135,7 +135,9 @@ async def _wait(process: subprocess.Popen[bytes], output: int, timeout_s: float)
     ended = asyncio.Event()
     kept = bytearray()
 
-    def drain() -> bool:
+    later: asyncio.TimerHandle | None = None
+
+    def read() -> bool:
         """Whether there may be more."""
         with contextlib.suppress(BlockingIOError):
             text = os.read(output, 65536)
@@ -143,21 +145,15 @@ async def _wait(process: subprocess.Popen[bytes], output: int, timeout_s: float)
             return bool(text)
         return True
 
-    async def drain_all() -> None:
-        more = asyncio.Event()
-        loop.add_reader(output, more.set)
-        try:
-            while await more.wait() and drain():
-                loop.remove_reader(output)
-                await asyncio.sleep(OUTPUT_S)
-                more.clear()
-                loop.add_reader(output, more.set)
-        finally:
-            loop.remove_reader(output)
+    def drain() -> None:
+        nonlocal later
+        loop.remove_reader(output)
+        if read():
+            later = loop.call_later(OUTPUT_S, loop.add_reader, output, drain)
 
     pidfd = os.pidfd_open(process.pid)
     loop.add_reader(pidfd, ended.set)
-    draining = loop.create_task(drain_all())
+    loop.add_reader(output, drain)
     ending = None
     try:
         await asyncio.wait_for(ended.wait(), timeout_s)
@@ -165,8 +161,10 @@ async def _wait(process: subprocess.Popen[bytes], output: int, timeout_s: float)
         pass
     finally:
         loop.remove_reader(pidfd)
-        draining.cancel()
-        loop.remove_reader(output)  # before it is closed
+        # Both at once: output is closed next, and its number may be another reader's then.
+        loop.remove_reader(output)
+        if later is not None:
+            later.cancel()
         os.close(pidfd)
         if not ended.is_set():
             # On request, it kills the command's whole process group; if killed itself, only the command dies
@@ -177,7 +175,7 @@ async def _wait(process: subprocess.Popen[bytes], output: int, timeout_s: float)
         process.wait()
     else:
         await ending
-    drain()
+    read()
     return bytes(kept)
 
 
