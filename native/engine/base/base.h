@@ -500,6 +500,8 @@ void rt_priority_step(void);
 void rt_priority_share(pid_t tid);
 /* Takes it back. */
 void rt_priority_unshare(pid_t tid);
+/* Gives it to a task of ours for good, but not to its children; best effort. */
+bool rt_priority_give(pid_t tid);
 /* Gives it to a process that has an ordinary one, but not to its children; it has to end it itself
  * (rt_priority_begin_lent()), or rt_priority_reclaim().  False: it was not given. */
 bool rt_priority_lend(pid_t pid);

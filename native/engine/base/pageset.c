@@ -136,19 +136,18 @@ uint64_t pageset_count(const struct pageset *set)
 
 bool pageset_take(struct pageset *from, uint64_t pages, struct pageset *to)
 {
-	uint32_t first = from->count, count;
+	uint32_t first = from->count;
 	uint64_t taken = 0;
 
 	while (first && taken < pages)
 		taken += pages_in(&from->chunk[--first]);
-	count = from->count - first;
-	*to = (struct pageset){ count, count, count ? calloc(count, sizeof *to->chunk) : NULL };
-	if (count && !to->chunk) {
-		*to = (struct pageset){ 0 };
+	if (first == from->count)
+		return true;
+	to->chunk = calloc(from->count - first, sizeof *to->chunk);
+	if (!to->chunk)
 		return false;
-	}
-	if (count)
-		memcpy(to->chunk, &from->chunk[first], count * sizeof *to->chunk);
+	to->count = to->room = from->count - first;
+	memcpy(to->chunk, &from->chunk[first], to->count * sizeof *to->chunk);
 	from->count = first;
 	return true;
 }

@@ -8,6 +8,11 @@
  * task, which may need this very CPU.  And the application, which may be hostile, decides how much there
  * is to do: what takes too much CPU time is done with an ordinary priority, or a few containers could
  * keep all others from every CPU.
+ *
+ * SCHED_RR, not SCHED_FIFO.  The kernel, too, spins on other tasks: who opens or reaps in /proc what has
+ * just ended waits in a loop for names that another task is freeing (fs/dcache.c,
+ * shrink_dcache_parent()).  If that one is a guard or an init as well, it waits for a CPU behind the
+ * first, and with SCHED_FIFO for ever: two of those once kept two CPUs for 25 minutes.
  */
 #include <sched.h>
 #include <time.h>
@@ -15,6 +20,7 @@
 #include "base.h"
 
 #define MOST_NS (200 * NS_PER_MS) /* of CPU time */
+#define LENT (SCHED_RR | SCHED_RESET_ON_FORK)
 
 static __thread struct {
 	int depth, policy;
@@ -80,12 +86,16 @@ void rt_priority_step(void)
 	sched_setscheduler(0, before.policy, &before.param);
 }
 
-bool rt_priority_lend(pid_t pid)
+bool rt_priority_give(pid_t tid)
 {
 	const struct sched_param lowest = { .sched_priority = sched_get_priority_min(SCHED_RR) };
 
-	return pid > 0 && sched_getscheduler(pid) == SCHED_OTHER &&
-	       sched_setscheduler(pid, SCHED_RR | SCHED_RESET_ON_FORK, &lowest) == 0;
+	return sched_setscheduler(tid, LENT, &lowest) == 0;
+}
+
+bool rt_priority_lend(pid_t pid)
+{
+	return pid > 0 && sched_getscheduler(pid) == SCHED_OTHER && rt_priority_give(pid);
 }
 
 /* If it still has that policy. */
@@ -99,7 +109,7 @@ static void take_back(pid_t pid, int policy)
 
 void rt_priority_reclaim(pid_t pid)
 {
-	take_back(pid, SCHED_RR | SCHED_RESET_ON_FORK);
+	take_back(pid, LENT);
 }
 
 void rt_priority_begin_lent(void)

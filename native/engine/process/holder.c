@@ -17,11 +17,10 @@
 static int make_holder(struct process *process, pid_t holder, struct avc_error *err)
 {
 	struct inj_call *own = &process->parasite.control->holder;
-	const struct sched_param first = { .sched_priority = 1 };
 
 	/* It clones while the whole app is stopped.  Best effort; not for its clones. */
 	if (process->descendant)
-		(void)sched_setscheduler(holder, SCHED_RR | SCHED_RESET_ON_FORK, &first);
+		(void)rt_priority_give(holder);
 	memcpy(own->out, "avckpt-hold", 12);
 	call_begin(own, INJ_AFTER_PARK);
 	/* Leaves the app's session and process group, which a process of the app may lead: their
@@ -97,13 +96,13 @@ static int keep_holder(struct process *process, pid_t holder, int result, struct
 	return -1;
 }
 
-/* A new task of ours, in its first stop.  *base: its registers there. */
+/* A new task of ours, in its first stop.  *base: its registers there; or NULL. */
 static int take_over(const struct process *process, pid_t task, struct arch_regs *base,
 		     struct avc_error *err)
 {
 	if (tracee_await(task, NULL, err) != STOP_TRAP)
 		return -1;
-	return parasite_own(&process->parasite, task) || arch_regs_get(task, base)
+	return parasite_own(&process->parasite, task) || (base && arch_regs_get(task, base))
 		       ? fail_errno(err, task, "make holder", "ptrace(SETOPTIONS)", "it has ended")
 		       : 0;
 }
@@ -195,12 +194,7 @@ static int clone_by(struct process *process, pid_t between, pid_t *holder, struc
 	if (parasite_send(&process->parasite, between, &process->holder_base, call, err) ||
 	    parasite_run_clone(between, call, holder, err))
 		return -1;
-	if (tracee_await(*holder, NULL, err) != STOP_TRAP)
-		return -1;
-	return parasite_own(&process->parasite, *holder)
-		       ? fail_errno(err, *holder, "make holder", "ptrace(SETOPTIONS)",
-				    "it has ended")
-		       : 0;
+	return take_over(process, *holder, NULL, err);
 }
 
 /* A child without exit signal that has ended. */

@@ -139,7 +139,6 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 						      : CLONE_PARENT | SIGCHLD;
 	const uint64_t arg[6] = { CLONE_VM | CLONE_FILES | shared };
 	const long options = (long)(porter->is_thread ? TRACE_OPTIONS_APP : TRACE_OPTIONS_OURS);
-	const struct sched_param first = { .sched_priority = 1 };
 	struct arch_regs homeward, regs;
 	long refused;
 	int born;
@@ -178,7 +177,7 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 	    seccomp_supervise(porter->tid, 0, options, porter->cave, ARCH_STUB_BYTES))
 		return fail_errno(err, porter->tid, "infect", "ptrace(SETOPTIONS)", "it has ended");
 	/* The main thread waits for it, and each of its calls takes two wake-ups.  Best effort. */
-	(void)sched_setscheduler(porter->tid, SCHED_RR, &first);
+	(void)rt_priority_give(porter->tid);
 	return 0;
 }
 

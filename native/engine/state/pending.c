@@ -122,9 +122,8 @@ static bool is_stop_heard(const struct process *process)
 {
 	struct proc_stat stat;
 
-	if (!tells_stops() || process->thread_count != 1 || !process->threads[0].stop_signal)
-		return false;
-	return proc_stat(process->pid, &stat) == 0 && !stat.exit_status;
+	return process->thread_count == 1 && process->threads[0].stop_signal && tells_stops() &&
+	       proc_stat(process->pid, &stat) == 0 && !stat.exit_status;
 }
 
 /* A process that has got a fatal signal and was stopped by us before it could die of it, or run its
@@ -159,8 +158,7 @@ int pending_read(struct process *process, struct avc_error *err)
 	pending->deadly = 0;
 	pending->caught = false;
 	pending->too_many = false;
-	process->stop_heard = thread_find(process, process->pid)->stop_signal &&
-			      is_stop_heard(process);
+	process->stop_heard = is_stop_heard(process);
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		struct thread *t = &process->threads[i];
 
