@@ -21,10 +21,18 @@ class Bucket:
 
     def has_one(self, now_s: float | None = None) -> bool:
         """Whether there was one left (now), which is taken."""
-        now_s = time.monotonic() if now_s is None else now_s
-        self.left = min(self.left + (now_s - self.at_s) * self.per_s, self.most)
-        self.at_s = now_s
+        self._fill(now_s)
         if self.left < 1:
             return False
         self.left -= 1
         return True
+
+    def is_full(self, now_s: float | None = None) -> bool:
+        """Whether it is as good as a new one."""
+        self._fill(now_s)
+        return self.left >= self.most
+
+    def _fill(self, now_s: float | None) -> None:
+        now_s = time.monotonic() if now_s is None else now_s
+        self.left = min(self.left + (now_s - self.at_s) * self.per_s, self.most)
+        self.at_s = now_s

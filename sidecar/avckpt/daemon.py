@@ -59,6 +59,7 @@ from avckpt.events.container_log import ContainerLog
 from avckpt.events.feed import Feed
 from avckpt.events.history import History
 from avckpt.events.journal import Journal
+from avckpt.events.log import Log
 from avckpt.events.metrics import Metrics
 from avckpt.events.record import EventRecord, of_guard
 from avckpt.events.system_journal import SystemJournal
@@ -147,7 +148,8 @@ class Daemon:
         self._host_units = units.Allowance()
         self._names = Names()
         self._presence = Presence(run_dir / "present.json")
-        self.groups = Groups(self.orders)
+        self._log = Log()
+        self.groups = Groups(self.orders, self._log)
         self._cpu = CpuBudget()
 
     async def run(self) -> None:
@@ -348,6 +350,7 @@ class Daemon:
         self._adopt()
         self._look_at_names()
         self._presence.keep(self.registry.live())
+        self._log.tell_what_is_left_out()
         for watch in list(self._watches.values()):
             if watch.guard is None and watch.settings.policy.guarded and not has_ended(watch.pidfd):
                 self._start_guard(watch)
@@ -513,10 +516,8 @@ class Daemon:
         if line is not None and line[0] >= logging.INFO:
             record = self.history.add(record)
         self.notifier.take(record, container, self._watches.values())
-        if line is not None:
-            log.log(line[0], "%s: %s", container.label, line[1])
-            if line[0] >= logging.INFO:
-                self._system_journal.tell(container.init_pid, container.label, *line)
+        if line is not None and self._log.tell(container.label, *line) and line[0] >= logging.INFO:
+            self._system_journal.tell(container.init_pid, container.label, *line)
         if record.kind is Kind.RESTORED and watch.settings.policy.mark:
             watch.own_log.tell(watch.pidfd, record.message)
         self.metrics.take(record)

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 from avckpt.cli.client import Client
+from avckpt.events.log import AT_ONCE, EACH_S
 from avckpt.evidence.crash import FRAMES_MAX
 from avckpt.evidence.deaths import PROCESSES_MAX, RING_PAGES_MAX, THREADS_ALL, Deaths
 
@@ -130,6 +131,34 @@ def test_long_names_fill_no_history(sidecar: LocalSidecar, tmp_path: Path) -> No
     assert len(crash["crash"]["backtrace"].split()) == FRAMES_MAX
     assert len(json.dumps(crash)) < 10_000
     assert max(map(len, sidecar.log.splitlines())) < 1000
+
+
+def test_deaths_fill_no_log(sidecar: LocalSidecar) -> None:
+    """It may have 64 restores a second, and dies another death each time."""
+    labels = {**ON_COMMAND, "avckpt.restore.max": "64/1s"}
+    victim = sidecar.protected("victim", ["sleep", "1000"], labels)
+    deaths = 0
+
+    def is_cut_short() -> bool:
+        nonlocal deaths
+        if deaths % 20 == 0:
+            time.sleep(1.1)  # it has lived long enough to go on with a new generation
+            take_checkpoint(sidecar.client, victim.name)
+        dead = victim.app_pid
+        os.kill(dead, (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS)[deaths % 3])
+        deaths += 1
+        wait_until(lambda: victim.app_pid not in (0, dead), 10, "it is restored", every_s=0.001)
+        return "lines are left out" in sidecar.log
+
+    begun = time.monotonic()
+    wait_until(is_cut_short, 60, "it has had enough lines", every_s=0.01)
+    lines = sum("victim: " in line for line in sidecar.log.splitlines())
+    assert lines <= AT_ONCE + (time.monotonic() - begun) / EACH_S * 1.5 + 1
+    # None of them is missing in the history, of which half is its own.
+    wait_until(lambda: sidecar.row(victim)["restores"] == deaths, 10, "all are told of")
+    kept = [event["restores"] for event in sidecar.events("victim", "restored")]
+    assert kept == list(range(deaths - len(kept) + 1, deaths + 1))
+    assert len(kept) > 100
 
 
 def test_an_exit_has_no_place(sidecar: LocalSidecar) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from avckpt.events.log import Log
 from avckpt.events.record import EventRecord
 from avckpt.events.vocabulary import Kind
 from avckpt.guard import Event
@@ -30,7 +31,7 @@ class Scripted(Groups):
     """A group of one member, whose lines come out as a test says."""
 
     def __init__(self, outcomes: list[Kind]) -> None:
-        super().__init__(Orders())
+        super().__init__(Orders(), Log())
         self.outcomes = outcomes
         self.pauses: list[float] = []
 

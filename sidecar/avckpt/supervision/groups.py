@@ -23,6 +23,7 @@ from avckpt_hooks.shared.labels import KEEP_MAX
 from avckpt.containers import cgroup
 from avckpt.engine import Guard, meeting
 from avckpt.errors import AvckptError, Busy, NothingToRestore, TargetGone
+from avckpt.events.log import Log
 from avckpt.events.record import EventRecord
 from avckpt.events.vocabulary import Kind
 from avckpt.guard import Command, Event
@@ -30,8 +31,6 @@ from avckpt.orders import Orders, check
 
 if TYPE_CHECKING:
     from avckpt.daemon import Watch
-
-log = logging.getLogger("avckpt")
 
 FIRST_S = 0.3
 """Longest time from a member's start to a line with it: others may be starting, too."""
@@ -104,8 +103,9 @@ def end_haste() -> None:
 class Groups:
     """All groups with a common recovery. For one event loop."""
 
-    def __init__(self, orders: Orders) -> None:
+    def __init__(self, orders: Orders, log: Log) -> None:
         self._orders = orders
+        self._log = log
         self._groups: dict[str, Group] = {}
 
     def join(self, watch: Watch) -> None:
@@ -189,6 +189,9 @@ class Groups:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
+    def _tell(self, group: Group, level: int, text: str) -> None:
+        self._log.tell(f"group {group.name}", level, text)
+
     def _group_of(self, watch: Watch) -> Group | None:
         cookie = watch.container.cookie
         return next((group for group in self._groups.values() if cookie in group.members), None)
@@ -212,7 +215,7 @@ class Groups:
                     if not group.dead:
                         await self._take_line(group)
                 except (AvckptError, OSError) as error:
-                    log.error("group %s: a line could not be taken: %s", group.name, error)
+                    self._tell(group, logging.ERROR, f"a line could not be taken: {error}")
 
     def _pause_s(self, group: Group) -> float:
         without_s = None if group.without is None else asyncio.get_running_loop().time() - group.without
@@ -276,7 +279,7 @@ class Groups:
             group.broken[cookie] = PATIENCE - 1
         elif group.broken[cookie] == PATIENCE + 1:
             label = group.members[cookie].container.label
-            log.warning("group %s: the next %d lines are taken without %s", group.name, SKIPPED, label)
+            self._tell(group, logging.WARNING, f"the next {SKIPPED} lines are taken without {label}")
         return True
 
     def _breakers(self, answers: dict[int, Answer | AvckptError]) -> list[int]:
@@ -323,11 +326,11 @@ class Groups:
                 try:
                     await self._recall(group, line)
                 except (AvckptError, OSError) as error:
-                    log.error("group %s: it cannot go back to line %d: %s", group.name, line.number, error)
+                    self._tell(group, logging.ERROR, f"it cannot go back to line {line.number}: {error}")
                     break
             for cookie in list(group.dead):
                 watch = group.members[cookie]
-                log.error("group %s: there is no line to go back to with %s", group.name, watch.container.label)
+                self._tell(group, logging.ERROR, f"there is no line to go back to with {watch.container.label}")
                 with contextlib.suppress(TargetGone, Busy):
                     if watch.guard is not None:
                         watch.guard.command(Command.ABANDON, 0)
@@ -352,7 +355,7 @@ class Groups:
         members = {cookie: able[cookie] for cookie in line.generations if cookie in able}
         for cookie in line.generations.keys() - members.keys():
             label = group.members[cookie].container.label
-            log.warning("group %s: %s is paused, and is not rolled back", group.name, label)
+            self._tell(group, logging.WARNING, f"{label} is paused, and is not rolled back")
         # Whatever the outcome, newer ones are useless.
         group.lines = group.lines[: group.lines.index(line) + 1]
         with meeting(len(members)) as fd:
@@ -362,5 +365,5 @@ class Groups:
                 lambda cookie, guard, ticket: guard.recall(fd, line.number, line.generations[cookie], ticket),
             )
         if all(isinstance(answer, tuple) and answer[0].kind is Kind.RESTORED for answer in answers.values()):
-            log.warning("group %s: went back to line %d together (%d members)", group.name, line.number, len(members))
+            self._tell(group, logging.WARNING, f"went back to line {line.number} together ({len(members)} members)")
         return answers
