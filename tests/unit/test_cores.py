@@ -70,6 +70,16 @@ def test_one_container_has_at_most_half_of_the_room(tmp_path: Path) -> None:
     assert left(tmp_path, core(tmp_path, "web", 0, KEPT_BYTES // 5)) == {"web.0", "web.1", "other.5"}
 
 
+def test_a_clock_that_is_set_makes_none_older(tmp_path: Path) -> None:
+    """Of a vehicle that crashes before it knows the time of day; then the first core is from decades ago."""
+    folder = Cores(tmp_path)
+    first = core(tmp_path, "web", 0)
+    folder.prune("web", first)
+    os.utime(first, (time.time() - 20 * 365 * 86400,) * 2)
+    folder.prune("web", core(tmp_path, "web", 1))
+    assert first.exists()
+
+
 def test_old_ones_go(tmp_path: Path) -> None:
     core(tmp_path, "other", KEPT_S - 100)
     core(tmp_path, "other", KEPT_S + 100)

@@ -121,6 +121,8 @@ void files_check_calls(const struct parasite *parasite, uint32_t slot, pid_t ins
 int files_check_strict(const struct image *image, pid_t pid, int pidfd, pid_t init, pid_t holder,
 		       struct avc_error *err) warn_unused;
 
+/* Whether the time of day was set since: then a time stamp does not say what came first. */
+bool files_clock_was_set(const struct files *files);
 /* Whether it looks like a database, as of files_prepare(): writes by other processes matter,
  * too. */
 bool files_is_database(const struct process *process);
@@ -380,6 +382,7 @@ struct files {
 	bool several;           /* other processes may have the other ends of pipes        */
 	bool with_tcp;          /* count the bytes of connections, during a freeze, too      */
 	uint64_t taken_ns;      /* CLOCK_REALTIME                                       */
+	uint64_t boot_ns;       /* CLOCK_BOOTTIME at that instant                       */
 	struct file *file;      /* by fd, ascending                                     */
 	struct file_area *area; /* allocated                                       */
 	uint32_t areas;

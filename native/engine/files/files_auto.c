@@ -148,14 +148,24 @@ bool files_is_database(const struct process *process)
 	return false;
 }
 
+/* The time of day may have been another one when it was created, even a later one than now. */
+static bool is_born_since(const struct files *files, int fd)
+{
+	struct timespec now;
+	struct statx born;
+	uint64_t born_ns;
+
+	if (!fd_look(fd, STATX_BTIME, &born) || !(born.stx_mask & STATX_BTIME))
+		return false;
+	clock_gettime(CLOCK_REALTIME, &now);
+	born_ns = (uint64_t)born.stx_btime.tv_sec * NS_PER_S + born.stx_btime.tv_nsec;
+	return born_ns > files->taken_ns && born_ns <= real_ns(&now) && !files_clock_was_set(files);
+}
+
 bool files_is_older(const struct image *image, int fd, const struct stat *st)
 {
-	struct statx born;
-
 	/* One that was created since does not matter. */
-	if (fd_look(fd, STATX_BTIME, &born) && born.stx_mask & STATX_BTIME &&
-	    (uint64_t)born.stx_btime.tv_sec * NS_PER_S + born.stx_btime.tv_nsec >
-		    image->files->taken_ns)
+	if (is_born_since(image->files, fd))
 		return false;
 	/* Of what was open for writing, files_check_auto() knows more. */
 	for (uint32_t i = 0; i < image->files->count; i++) {

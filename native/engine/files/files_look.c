@@ -197,6 +197,41 @@ static bool may_be_served(struct look *look)
 	return mounts_may_be_served(&look->mounts, look->pid);
 }
 
+#define ASIDE_NS NS_PER_MS
+#define ASIDE_TRIES 3
+
+/* Both clocks at one instant: without what may have come in between the two calls. */
+static void read_clocks(uint64_t *real_ns, uint64_t *boot_ns)
+{
+	struct timespec real, before, after;
+
+	for (int i = 0; i < ASIDE_TRIES; i++) {
+		clock_gettime(CLOCK_BOOTTIME, &before);
+		clock_gettime(CLOCK_REALTIME, &real);
+		clock_gettime(CLOCK_BOOTTIME, &after);
+		*real_ns = (uint64_t)real.tv_sec * NS_PER_S + (uint64_t)real.tv_nsec;
+		*boot_ns = (uint64_t)before.tv_sec * NS_PER_S + (uint64_t)before.tv_nsec;
+		if ((uint64_t)after.tv_sec * NS_PER_S + (uint64_t)after.tv_nsec <
+		    *boot_ns + ASIDE_NS)
+			break;
+	}
+}
+
+/* What both clocks may differ by in a second that nobody has set one in is 0.5 ms (adjtimex(2)). */
+#define SET_NS (50 * NS_PER_MS)
+#define SLEW 1000
+
+bool files_clock_was_set(const struct files *files)
+{
+	uint64_t real_ns, boot_ns;
+	int64_t passed, shown;
+
+	read_clocks(&real_ns, &boot_ns);
+	passed = (int64_t)(boot_ns - files->boot_ns);
+	shown = (int64_t)(real_ns - files->taken_ns);
+	return llabs(shown - passed) > (int64_t)SET_NS + passed / SLEW;
+}
+
 int files_look(struct files *files, const struct files_owner *owner, enum files_depth depth,
 	       struct files *known, struct avc_error *err)
 {
@@ -211,7 +246,6 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 			     .likely = owner->likely,
 			     .likely_count = owner->reuses ? owner->likely_count : 0,
 			     .depth = depth };
-	struct timespec now;
 	int result;
 
 	look.fd_dir = proc_open(pid, "fd", O_RDONLY | O_DIRECTORY);
@@ -229,8 +263,7 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 	}
 	files->count = 0;
 	files->mounts = depth == FILES_BEFORE ? mounts_stamp(pid) : 0;
-	clock_gettime(CLOCK_REALTIME, &now);
-	files->taken_ns = (uint64_t)now.tv_sec * NS_PER_S + (uint64_t)now.tv_nsec;
+	read_clocks(&files->taken_ns, &files->boot_ns);
 	if (files->missing && !files->missing->count)
 		result = walk_known(&look, err);
 	else if (depth == FILES_FROZEN && known && known->count <= files->room)

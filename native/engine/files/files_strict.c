@@ -68,7 +68,8 @@ int files_check_strict(const struct image *image, pid_t pid, int pidfd, pid_t in
 		const struct file *n = &now->file[i], *w = files_find(want, n->fd);
 
 		if (is_data(n) && !(w && files_same_object(w, n)) &&
-		    real_ns(&n->modified) + TICK_NS > want->taken_ns) {
+		    (real_ns(&n->modified) + TICK_NS > want->taken_ns ||
+		     files_clock_was_set(want))) {
 			fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
 			     "avckpt.files=strict: %.80s was written since the checkpoint",
 			     n->name);

@@ -45,6 +45,8 @@ class Cores:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._turn = asyncio.Semaphore(AT_ONCE)
+        self._written_s: dict[Path, float] = {}
+        """When, by CLOCK_BOOTTIME: the time of day may be set by decades since."""
 
     async def make(self, container: Protected, case: Case, crash: Crash, mode: str) -> tuple[str, int, str]:
         """Writes one; its path and size, and in words what it is or why there is none."""
@@ -79,9 +81,13 @@ class Cores:
     def prune(self, name: str, newest: Path) -> None:
         """Makes room, oldest first; the newest stays."""
         found = []
+        now_s = time.clock_gettime(time.CLOCK_BOOTTIME)
         for path in self._folder.glob(f"*{SUFFIX}"):
             with contextlib.suppress(OSError):
-                found.append((path.stat().st_mtime, path.stat().st_size, path))
+                status = path.stat()
+                at = self._written_s.get(path, now_s - max(time.time() - status.st_mtime, 0))
+                found.append((at, status.st_size, path))
+        self._written_s = {path: at for at, _, path in found}
         # Where they are, others may have files to write: usually it is /run.
         room = min(KEPT_BYTES, (sum(size for _, size, _ in found) + _free_bytes(self._folder)) // 2)
         total = count = its_bytes = 0
@@ -91,7 +97,7 @@ class Cores:
             count += is_its
             its_bytes += is_its * size
             too_many = total > room or (is_its and (count > KEPT_OF_EACH or its_bytes > room // 2))
-            if path != newest and (too_many or time.time() - at > KEPT_S):
+            if path != newest and (too_many or now_s - at > KEPT_S):
                 with contextlib.suppress(OSError):
                     path.unlink()
                 total -= size
