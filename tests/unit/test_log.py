@@ -21,7 +21,7 @@ def test_who_has_too_much_to_say_is_cut_short_and_nobody_else(caplog: pytest.Log
     log.tell_what_is_left_out()
     assert caplog.messages[told:] == [
         "quiet: is there",
-        f"noisy: {2 * AT_ONCE - told} lines are left out here, avckpt events has them",
+        f"noisy: {2 * AT_ONCE - told} line(s) left out here; its events are in avckpt events",
     ]
 
 

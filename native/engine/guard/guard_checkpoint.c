@@ -401,6 +401,16 @@ static void make_spare(struct avc_guard *guard, struct generation *newest)
 	last_pid_unlock(guard->channel.numbers_fd);
 }
 
+/* It may be in our PID namespace, and is not to have the number of a dead application whose guard
+ * chooses numbers there now. */
+static void prepare_helper(const struct avc_guard *guard)
+{
+	if (!last_pid_lock(guard->channel.numbers_fd, false))
+		return;
+	last_pid_prepare(guard->channel.init_pidfd);
+	last_pid_unlock(guard->channel.numbers_fd);
+}
+
 static void work_ahead(struct avc_guard *guard)
 {
 	struct generation *newest;
@@ -409,7 +419,7 @@ static void work_ahead(struct avc_guard *guard)
 	guard->ahead_ns = UINT64_MAX;
 	if (!guard->count)
 		return;
-	last_pid_prepare(guard->channel.init_pidfd);
+	prepare_helper(guard);
 	newest = &guard->generations[guard->count - 1];
 	if (wants_spare(guard, newest)) {
 		make_spare(guard, newest);

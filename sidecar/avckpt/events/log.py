@@ -44,7 +44,7 @@ class Log:
         """To be called every few seconds."""
         for whose, room in list(self._rooms.items()):
             if room.left_out:
-                log.warning("%s: %d lines are left out here, avckpt events has them", whose, room.left_out)
+                log.warning("%s: %d line(s) left out here; its events are in avckpt events", whose, room.left_out)
                 room.left_out = 0
             elif room.bucket.is_full():
                 del self._rooms[whose]
