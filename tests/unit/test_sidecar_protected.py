@@ -150,6 +150,14 @@ def test_an_end_without_a_word_is_a_stop() -> None:
     assert container.reason == "the container was stopped or killed"
 
 
+@pytest.mark.parametrize("events", [(), (ATTACHED,)])
+def test_an_end_before_the_first_checkpoint_may_be_any(events: tuple[Event, ...]) -> None:
+    """A command that takes a moment has exited by itself, before its guard was there."""
+    container = protected(*events)
+    container.end(2000.0)
+    assert container.reason == "the container has ended, no guard saw how"
+
+
 def test_json_names_every_field_that_the_api_promises() -> None:
     data = protected(ATTACHED, CHECKPOINT, DIED, RESTORED).to_json()
     assert data["state"] == "protected"

@@ -157,7 +157,9 @@ class Protected:
     def end(self, at: float) -> None:
         """Its init is gone."""
         if self.state is not State.ENDED:
-            self._to(State.ENDED, f"{'it' if self.node_of else 'the container'} was stopped or killed")
+            # By a guard that held a checkpoint, any other end would have been told.
+            how = "was stopped or killed" if self.state is State.PROTECTED else "has ended, no guard saw how"
+            self._to(State.ENDED, f"{'it' if self.node_of else 'the container'} {how}")
         self.generations = 0
         self.memory_bytes = 0
         self.ended_at = at
