@@ -27,13 +27,13 @@ VALUES_MOST = 100_000
 
 @dataclass(frozen=True, order=True)
 class Place:
-    """A line of a file, counted from 1."""
+    """A line of a file, counted from 1; 0: the file itself, whatever is in it."""
 
     file: str
     line: int
 
     def __str__(self) -> str:
-        return f"{self.file}:{self.line}"
+        return f"{self.file}:{self.line}" if self.line else self.file
 
 
 class Unreadable(Exception):
@@ -69,11 +69,11 @@ def read_all(path: Path, *, several: bool = True) -> list[yaml.Node]:
     try:
         text = read_bounded(str(path), FILE_BYTES).decode()
     except TooLong as error:
-        raise Unreadable(Place(str(path), 1), f"longer than {FILE_BYTES} bytes") from error
+        raise Unreadable(Place(str(path), 0), f"longer than {FILE_BYTES} bytes") from error
     except OSError as error:
-        raise Unreadable(Place(str(path), 1), error.strerror or str(error)) from error
+        raise Unreadable(Place(str(path), 0), error.strerror or str(error)) from error
     except UnicodeDecodeError as error:
-        raise Unreadable(Place(str(path), 1), f"not UTF-8: {error.reason}") from error
+        raise Unreadable(Place(str(path), 0), f"not UTF-8: {error.reason}") from error
     try:
         if several:
             roots = list(yaml.compose_all(text, Loader=_Loader))

@@ -156,6 +156,7 @@ def test_the_rest_of_the_table() -> None:
         ("shm", "big", "not a size"),
         ("shm", "4IB", "not a size"),
         ("shm", "2GB", "too large"),
+        ("shm", "4", "less than a page: is its unit missing?"),
         ("quiesce", "2s", "more than 1s"),
         ("quiesce", "20", "a duration needs a unit"),
         ("group", "two words", "not a name"),

@@ -248,7 +248,7 @@ def test_a_file_that_may_not_be_read_is_a_wrong_file(path: Path, monkeypatch: py
     monkeypatch.setattr(yamlfile, "read_bounded", refuse)
     assert avckpt("check", path) == (
         1,
-        f"{path}:1: Permission denied\n0 services, to be protected: none; 1 problem\n",
+        f"{path}: Permission denied\n0 services, to be protected: none; 1 problem\n",
     )
 
 
@@ -274,15 +274,18 @@ def test_the_command(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert avckpt("check", "-f", "compose.yml") == avckpt("check", "compose.yml")
     assert avckpt("check", "gone.yaml") == (
         1,
-        "gone.yaml:1: No such file or directory\n0 services, to be protected: none; 1 problem\n",
+        "gone.yaml: No such file or directory\n0 services, to be protected: none; 1 problem\n",
     )
 
 
 def test_down_of_what_is_not_there(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(podman_compose.Compose, "down", lambda *_: pytest.fail("podman-compose was started"))
-    assert avckpt("down", "-f", path) == (1, f"avckpt: {path}:1: No such file or directory\n")
+    assert avckpt("down", "-f", path) == (1, f"avckpt: {path}: No such file or directory\n")
     path.write_text("services: {a: [}")
     assert avckpt("down", "-f", path)[1].startswith(f"avckpt: {path}:1: not YAML: ")
+    for text in ("", "services: []", "just words"):
+        path.write_text(text)
+        assert avckpt("down", "-f", path)[1].endswith(": is this a Compose file?\n")
     path.write_text("services: {a: {labels: {avckpt.enable: nonsense}}}")
     assert avckpt("down", "-f", path, "b") == (1, "avckpt: no such service: b; there are a\n")
     assert avckpt("down", "-f", path, path)[1].endswith(f"there are a; a file is named with -f {path}\n")

@@ -32,6 +32,7 @@ RESTORES_MAX = 64
 VALUE_MAX = 2048
 """Characters.  The sidecar takes microseconds for each character of a command, and does nothing else meanwhile."""
 SHM_MAX_BYTES = 1_000_000_000
+SHM_LEAST_BYTES = 4096
 AUTOMATIC_MAX = "3s"
 """The longest time between two checkpoints at avckpt.interval=auto, and the default where that cannot be."""
 
@@ -422,6 +423,8 @@ def _parse_shm(text: str) -> dict[str, Any]:
     size_bytes = int(found[1]) * (1024 if found[3] else 1000) ** " KMG".index(found[2] or " ")
     if size_bytes > SHM_MAX_BYTES:
         raise ValueError("too large, it is copied while the application stands still")
+    if 0 < size_bytes < SHM_LEAST_BYTES:
+        raise ValueError("less than a page: is its unit missing?")
     return {"shm_bytes": size_bytes}
 
 

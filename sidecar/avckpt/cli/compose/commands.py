@@ -140,6 +140,8 @@ def down(
         except yamlfile.Unreadable as error:
             raise ConfigError(str(error)) from error
     found = manifest.check(paths)  # for its services: wrong labels keep nobody from stopping what runs
+    if not found.services and found.problems:
+        raise ConfigError(str(found.problems[0]))
     _expect(found, services)
     if found.wants_protection and os.geteuid() != 0:
         raise Denied("protected containers are those of root's Podman: use sudo")
