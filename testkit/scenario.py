@@ -45,6 +45,7 @@ def restored(victim: Victim, guard: GuardProcess, *, looks: bool = True) -> Json
     since = guard.mark()
     victim.kill_app()
     event = guard.wait("restored", since=since)
+    print(event)  # whether it told of what is found wrong now
     if looks:
         wait_looked(victim, before)
     victim.check()
