@@ -193,12 +193,39 @@ def test_what_another_manifest_of_the_project_started_stays(project: Project) ->
     project.write(f"services: {{first: {plain}}}")
     project.avckpt("up")
     project.write(f"services: {{second: {plain}}}")
-    project.avckpt("up")
+    assert f"{project.name}_first_1: of another manifest" in project.avckpt("up").stderr
     assert f"{project.name}_first_1: of another manifest" in project.avckpt("down").stderr
     assert project.container("first").id in project.ids()
     project.write(f"services: {{first: {plain}}}")
     assert "manifest" not in project.avckpt("down").stderr
     assert not project.ids()
+
+
+@pytest.mark.parametrize("policy", ["never", "missing"])
+def test_an_image_that_is_missing_changes_nothing(podman: Podman, tmp_path: Path, policy: str) -> None:
+    """podman-compose removes what runs before it finds out."""
+    project = Project(f"avckpt-test-{os.getpid()}", tmp_path / "vehicle.yaml", podman)
+    plain = "network_mode: host, stop_grace_period: 0s, command: sleep 100"
+    there = f"{{image: {BASE_IMAGE}, {plain}}}"
+    image = f"dir:{tmp_path}/no-such-image"  # asks no registry
+    missing = f"{{image: '{image}', pull_policy: {policy}, depends_on: [there], {plain}}}"
+    services = "services:\n  there: {there}\n  node: {node}\n  user: {{depends_on: [node], {user}\n"
+    try:
+        project.write(services.format(there=there, node=there, user=there[1:]))
+        project.avckpt("up")
+        ids = project.ids()
+        project.write(services.format(there=there, node=missing, user=there[1:]))
+        for named in ([], ["user"]):
+            done = project.avckpt("up", *named, check=False)
+            assert (done.status, done.stdout) == (1, "")
+            last = done.stderr.splitlines()[-1]
+            assert last.startswith(f"avckpt: service node: the image {image} is not here, and cannot be pulled (")
+            assert last.endswith("): build it, or correct its name; nothing was started or stopped")
+            assert project.ids() == ids
+        project.avckpt("up", "there")
+        assert project.ids() == ids
+    finally:
+        project.remove()
 
 
 def test_files_that_nobody_names_are_those_of_podman_compose(

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -131,6 +132,28 @@ def test_a_sidecar_that_dies_meanwhile_is_told_in_words(run_dir: Path) -> None:
     assert result.exit_code == 3
     assert "Errno" not in result.stderr
     assert "the sidecar went away (" in result.stderr
+
+
+def test_a_reader_that_has_enough_ends_it_as_any_other_program() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "wb") as pipe:
+        done = subprocess.run(
+            [sys.executable, "-m", "avckpt", "completion", "bash"], stdout=pipe, stderr=subprocess.PIPE, text=True
+        )
+    assert (done.returncode, done.stderr) == (-signal.SIGPIPE, "")
+
+
+def test_ctrl_c_ends_it_as_any_other_program(run_dir: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as silent:
+        silent.bind(str(run_dir / "api.sock"))
+        silent.listen()
+        silent.settimeout(60)
+        ps = [sys.executable, "-m", "avckpt", "ps"]
+        with subprocess.Popen(ps, stderr=subprocess.PIPE, text=True) as process, silent.accept()[0]:
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=60)
+    assert (process.returncode, said) == (-signal.SIGINT, "avckpt: interrupted\n")
 
 
 @pytest.mark.parametrize("redirection", [">/dev/full", ">&-"])

@@ -68,6 +68,17 @@ def test_one_that_waits_in_vain_is_ended(podman: Path, waits: str, words: str, l
     wait_until(lambda: left_over(podman) == [], 5, "nobody waits any more")
 
 
+def test_one_that_asks_in_vain_again_and_again_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As it does for a container that does not exist: Podman says so at once, and is hardly ever seen."""
+    monkeypatch.setattr(podman_compose, "STUCK_S", 2.0)
+    ask = "subprocess.run(['true', 'wait', '--condition=running', 'a'])"
+    asks = f"import subprocess, time\nwhile True: {ask}; time.sleep(1)"
+    started = time.monotonic()
+    with pytest.raises(AvckptError, match="it waited in vain for a "):
+        Fake(f'exec {sys.executable} -c "{asks}"').up([], lambda line: None)
+    assert 2 <= time.monotonic() - started < 10
+
+
 @pytest.mark.parametrize("other", ["{0} pull image", "{0} wait --condition=stopped a", "{0} start a"])
 def test_one_that_does_something_is_waited_for(podman: Path, other: str) -> None:
     script = f"{other} & O=$!; {{0}} wait --condition=running b & W=$!; sleep 1.2; kill $O $W; exit 0"
@@ -130,9 +141,15 @@ def test_a_job_that_is_done_is_no_reason_for_a_failure(tmp_path: Path) -> None:
         def containers(self) -> list[Started]:
             return [container(name="job", status="exited"), container(name="bad", status="exited", exit_code=3)]
 
+        def services(self) -> list[str]:
+            return ["s", "other"]
+
     with pytest.raises(AvckptError) as failure:
         up(Two("echo bad port; exit 1"), [], tmp_path, 0, lambda line: None)
-    assert str(failure.value) == ("podman-compose up failed: bad port; bad has exited with status 3 (podman logs bad)")
+    why = (
+        "podman-compose up failed: bad port; bad has exited with status 3 (podman logs bad); without a container: other"
+    )
+    assert str(failure.value) == why
 
 
 def test_a_traceback_is_its_last_line() -> None:

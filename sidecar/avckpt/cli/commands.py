@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import signal
 import sys
 import time
 from collections.abc import Iterable
@@ -52,7 +53,7 @@ class Cli(click.Group):
             sys.stdout = open(os.devnull, "w")  # noqa: SIM115
         try:
             return super().main(*args, **more)
-        except OSError as error:  # of a pipe whose reader has enough click takes care
+        except OSError as error:
             what = "the output cannot be written" if error.filename is None else printable(str(error.filename))
             click.echo(f"avckpt: {what}: {error.strerror or error}", err=True)
             with contextlib.suppress(OSError):  # Python would try once more to write what is left
@@ -66,6 +67,17 @@ class Cli(click.Group):
         except AvckptError as error:
             click.echo(f"avckpt: {error}", err=True)
             sys.exit(int(error.exit_code))
+        except KeyboardInterrupt:
+            click.echo("avckpt: interrupted", err=True)
+            _end_by(signal.SIGINT)
+        except BrokenPipeError:  # a reader such as head(1) has enough
+            _end_by(signal.SIGPIPE)
+
+
+def _end_by(signum: signal.Signals) -> None:
+    """Ends this process as a program ends that leaves the signal alone: shells then know why."""
+    signal.signal(signum, signal.SIG_DFL)
+    os.kill(os.getpid(), signum)
 
 
 @click.group(cls=Cli, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})

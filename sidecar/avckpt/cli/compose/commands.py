@@ -101,7 +101,15 @@ def up(
         _say(line)
     if found.wants_protection:
         vehicle.prepare(run_dir, install_hooks=install_hooks, say=_say)
-    came_out = vehicle.up(compose, services, run_dir, wait_s, _say)
+    compose.fetch_images(services, _say)
+    try:
+        came_out = vehicle.up(compose, services, run_dir, wait_s, _say)
+    except KeyboardInterrupt:
+        _say("what was started stays: avckpt up continues, avckpt down removes it")
+        raise
+    others = sorted(one.container.name for one in came_out if one.container.service not in found.services)
+    if others:
+        _say(f"{', '.join(others)}: of another manifest of this project, or of a service that was removed; stays")
     if as_json:
         click.echo(json.dumps([one.to_json() for one in came_out], indent=2))
     else:

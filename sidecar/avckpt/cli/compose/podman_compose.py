@@ -22,8 +22,10 @@ from pathlib import Path
 from typing import IO, Any
 
 import psutil
+import yaml
 from avckpt_hooks.shared.labels import LabelError, merge, parse_policy
 
+from avckpt.cli.podman import podman
 from avckpt.errors import AvckptError
 
 STUCK_S = 5.0
@@ -32,6 +34,8 @@ UNHEALTHY_S = 300.0
 """The same where it waits for one to become healthy."""
 LOOK_EVERY_S = 0.2
 QUERY_TIMEOUT_S = 60.0
+PULL_S = 86400.0
+"""Images of robots are large, and their networks slow: whoever has enough presses Ctrl-C."""
 
 Say = Callable[[str], None]
 """Receives a line for the waiting user."""
@@ -91,6 +95,29 @@ class Compose:
         """
         return self._run(["up", "-d", *services], say)
 
+    def fetch_images(self, services: Sequence[str], say: Say) -> None:
+        """Pulls images that are missing here.  Raises AvckptError, with service and image, when one cannot be had.
+
+        With Podman before 5.6 podman-compose removes what runs before it looks for the new image.
+        """
+        defined = yaml.safe_load(self._ask([*self._command, "config"]))["services"]
+        users: dict[tuple[str, bool], list[str]] = {}
+        for name in _with_dependencies(services, defined) if services else defined:
+            service = defined.get(name) or {}
+            image = service.get("image")
+            if image and "build" not in service and "platform" not in service:
+                users.setdefault((str(image), service.get("pull_policy") != "never"), []).append(name)
+        failures = []
+        for (image, may_pull), names in users.items():
+            if podman("image", "exists", image, check=False).returncode == 0:
+                continue
+            whose = f"service {', '.join(names)}"
+            why = _pull(image, whose, say) if may_pull else "its pull_policy is never"
+            if why:
+                failures.append(f"{whose}: the image {image} is not here, and cannot be pulled ({why})")
+        if failures:
+            raise AvckptError(f"{'; '.join(failures)}: build it, or correct its name; nothing was started or stopped")
+
     def down(self, services: Sequence[str], volumes: bool, say: Say) -> None:
         """`down`.  Raises AvckptError when it fails."""
         self._run(["down", *(["--volumes"] if volumes else []), *services], say)
@@ -148,6 +175,26 @@ class Compose:
         return AvckptError(f"{where}{command} failed: {why[exception.end() :] if exception else why}")
 
 
+def _with_dependencies(names: Sequence[str], services: dict[str, Any]) -> list[str]:
+    found: dict[str, None] = {}
+    todo = list(names)
+    while todo:
+        name = todo.pop(0)
+        if name not in found:
+            found[name] = None
+            todo += (services.get(name) or {}).get("depends_on") or ()
+    return list(found)
+
+
+def _pull(image: str, whose: str, say: Say) -> str:
+    """Returns why it cannot be pulled, or ""."""
+    say(f"{whose}: pulling the image {image}")
+    done = podman("pull", "--quiet", image, check=False, timeout_s=PULL_S)
+    if done.returncode == 0:
+        return ""
+    return (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1].removeprefix("Error: ")
+
+
 def _called(command: Sequence[str]) -> str:
     """What a user would call it."""
     return f"podman-compose {command[-2]}" if "podman_compose" in command else " ".join(command[:2])
@@ -156,34 +203,41 @@ def _called(command: Sequence[str]) -> str:
 def _watch(process: subprocess.Popen[bytes], look: Callable[[], None]) -> list[str]:
     """Waits for podman-compose's end; the containers it hangs on if it hangs, else none."""
     waiting_since: float | None = None
+    awaited: dict[str, str] = {}
     while True:
         try:
             process.wait(LOOK_EVERY_S)
             return []
         except subprocess.TimeoutExpired:
             look()
-        awaited = _awaited(process.pid)
+        seen = _awaited(process.pid)
         now = time.monotonic()
-        if awaited is None:
-            waiting_since = None
-        elif awaited:
-            waiting_since = waiting_since or now
-            patience_s = UNHEALTHY_S if _HEALTHY in awaited.values() else STUCK_S
-            if now - waiting_since > patience_s:
-                return sorted(f"{name} to become {_WAITS[awaited[name]]}" for name in awaited)
+        if seen is None:
+            waiting_since, awaited = None, {}
+            continue
+        awaited = seen or awaited
+        waiting_since = waiting_since or now
+        patience_s = UNHEALTHY_S if _HEALTHY in awaited.values() else STUCK_S
+        if now - waiting_since > patience_s:
+            names = sorted(f"{name} to become {_WAITS[awaited[name]]}" for name in awaited)
+            return names or ["a container that does not exist"]
 
 
 def _awaited(pid: int) -> dict[str, str] | None:
     """Containers it waits for, and for what; None: it does something else too; empty: nothing at this moment."""
     awaited: dict[str, str] = {}
     try:
-        children = psutil.Process(pid).children()
+        parent = psutil.Process(pid)
+        own, children = parent.cmdline(), parent.children()
+        # For a container that does not exist it asks each second: Podman says at once that there is none.
+        if not children and parent.status() != psutil.STATUS_SLEEPING:
+            return None
     except psutil.NoSuchProcess:
         return None
     for child in children:
         try:
             command = child.cmdline()
-            if child.status() == psutil.STATUS_ZOMBIE:
+            if child.status() == psutil.STATUS_ZOMBIE or command in ([], own):  # it is ending, or starting
                 continue
         except psutil.NoSuchProcess:
             continue

@@ -101,15 +101,17 @@ def up(compose: Compose, services: Sequence[str], run_dir: Path, wait_s: float, 
     except AvckptError as error:
         failure = error
     started = [one for one in compose.containers() if not services or one.service in services or _runs(one)]
-    if complaint:
-        # Of some errors podman-compose says nothing in its status; without one there may be none on purpose (scale: 0).
+    if failure is not None or complaint:
         there = {one.service for one in started}
-        lacking = [name for name in services or compose.services() if name not in there]
+        lacking = ", ".join(name for name in services or compose.services() if name not in there)
+        if failure is not None:
+            reasons = [f"{one.name} {_why_not_running(one)}" for one in started if _may_be_why(one, str(failure))]
+            if lacking:
+                reasons.append(f"without a container: {lacking}")
+            raise AvckptError("; ".join([str(failure), *reasons]))
+        # Of some errors podman-compose says nothing in its status; without one there may be none on purpose (scale: 0).
         if lacking:
-            failure = AvckptError(f"{', '.join(lacking)} has no container: {complaint.removeprefix('Error: ')}")
-    if failure is not None:
-        reasons = [f"{one.name} {_why_not_running(one)}" for one in started if _may_be_why(one, str(failure))]
-        raise AvckptError("; ".join([str(failure), *reasons]))
+            raise AvckptError(f"{lacking} has no container: {complaint.removeprefix('Error: ')}")
     return wait_protected(compose, Client(run_dir), started, wait_s)
 
 
