@@ -307,7 +307,24 @@ def _is_ours() -> bool:
 
 
 def _tell_if_alone(name: str, parent: int) -> bool:
-    """Warns when no sidecar listens.  True if the user has been told so."""
+    """Warns when no sidecar listens.  True if the user has been told so.  Waits for one that is starting."""
+    import time
+
+    from avckpt_hooks.shared import protocol
+
+    deadline = time.monotonic() + protocol.START_S
+    problem = _not_listening()
+    while problem and time.monotonic() < deadline and _is_starting():
+        time.sleep(0.02)
+        problem = _not_listening()
+    if not problem:
+        return False
+    line = f"container {name} runs unprotected until the sidecar is started ({protocol.hooks_socket()}: {problem})"
+    return warn(line, parent)
+
+
+def _not_listening() -> str:
+    """Why no sidecar can be reached, or ""."""
     import socket
 
     from avckpt_hooks.shared import protocol
@@ -317,11 +334,28 @@ def _tell_if_alone(name: str, parent: int) -> bool:
             connection.setblocking(False)
             connection.connect(protocol.hooks_socket())
     except BlockingIOError:  # it listens, and is busy
-        return False
+        return ""
     except OSError as error:
-        return warn(
-            f"container {name} runs unprotected until the sidecar is started "
-            f"({protocol.hooks_socket()}: {error.strerror})",
-            parent,
-        )
+        return error.strerror or str(error)
+    return ""
+
+
+def _is_starting() -> bool:
+    """A sidecar lives that may listen in a moment."""
+    import fcntl
+
+    from avckpt_hooks.shared import protocol
+
+    try:
+        fd = os.open(protocol.starting_lock(), os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(fd)
     return False

@@ -16,12 +16,15 @@ import struct
 import subprocess
 import sys
 import termios
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from avckpt.cli.client import COMMAND_S, Client
+from avckpt_hooks import precreate
+from avckpt_hooks.shared import protocol
 
 from testkit.cgroups import freezer
 from testkit.family import look
@@ -428,6 +431,20 @@ def test_a_sidecar_that_does_not_see_the_hosts_processes_says_so(local: LocalSid
     local.wait_for(old, state="protected")
 
 
+def test_hooks_know_of_it_before_it_listens(idle_sidecar: LocalSidecar, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For a container that is started right after it."""
+    monkeypatch.setenv("AVCKPT_RUN_DIR", str(idle_sidecar.run_dir))
+    start = threading.Thread(target=idle_sidecar.start)
+    start.start()
+    wait_until(precreate._is_starting, 60, "it says that it starts", every_s=0.005)
+    listened = os.path.exists(protocol.hooks_socket())
+    start.join()
+    assert not listened
+    assert not precreate._not_listening()
+    idle_sidecar.stop()
+    assert not precreate._is_starting()
+
+
 def test_it_takes_all_the_descriptors_it_may(idle_sidecar: LocalSidecar) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
@@ -446,7 +463,7 @@ def test_sigterm_leaves_the_application_running_and_nothing_else(local: LocalSid
     app = web.app_pid
     assert local.stop() == 0
     assert sorted(path.name for path in local.run_dir.iterdir()) == [
-        *("containers", "health", "history.jsonl", "lock", "present.json", "units")
+        *("containers", "health", "history.jsonl", "lock", "present.json", "starting", "units")
     ]
     assert not ended(web)
     # Templates are gone, the application is not traced any more and runs.

@@ -8,9 +8,12 @@ hook's Podman is a program that prints that answer.
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import socket
 import subprocess
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +21,7 @@ from typing import Any
 
 import pytest
 from avckpt_hooks import podman
+from avckpt_hooks.shared import protocol
 
 SAMPLES = Path(__file__).parent / "hooks_samples"
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -226,6 +230,29 @@ def test_without_a_sidecar_the_user_is_told(hook: Hook) -> None:
     result = hook(config, spec)
     assert "container web runs unprotected until the sidecar is started" in result.said
     assert "--told" in result.config["hooks"]["prestart"][-1]["args"]
+
+
+@pytest.mark.parametrize("comes", [True, False])
+def test_a_sidecar_that_is_starting_is_waited_for(
+    hook: Hook, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, comes: bool
+) -> None:
+    monkeypatch.setenv("AVCKPT_RUN_DIR", str(tmp_path / "run"))
+    (tmp_path / "run").mkdir()
+    config, spec = sample("labelled")
+    with open(protocol.starting_lock(), "w") as starting, socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as hooks:
+        fcntl.flock(starting, fcntl.LOCK_SH)
+        hooks.bind(protocol.hooks_socket())
+
+        def step() -> None:
+            (hooks.listen if comes else starting.close)()
+
+        timer = threading.Timer(1.0, step)
+        timer.start()
+        result = hook(config, spec)
+        early = timer.is_alive()
+        timer.join()
+    assert not early
+    assert ("runs unprotected until the sidecar is started" in result.said) is not comes
 
 
 def test_labels_that_can_not_be_read_let_the_container_start_and_are_said(hook: Hook) -> None:

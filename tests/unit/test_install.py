@@ -356,7 +356,7 @@ def test_uninstall_leaves_nothing_of_hooks_and_sidecar(root: Path) -> None:
     before = tree(root)
     install.install(root)
     folder = root / "run/avckpt"
-    for name in ("containers/x.json", "health/x.json", "history.jsonl", "present.json", "lock"):
+    for name in ("containers/x.json", "health/x.json", "history.jsonl", "present.json", "starting", "lock"):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text("")
     with socket.socket(socket.AF_UNIX) as left_behind:

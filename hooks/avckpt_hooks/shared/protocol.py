@@ -45,6 +45,9 @@ MAX_BYTES = 128 * 1024
 TIMEOUT_S = 1.0
 """A hook's total timeout for the sidecar, from connect to reply."""
 
+START_S = 2.0
+"""How long a hook waits for a sidecar that is starting."""
+
 
 class ProtocolError(ValueError):
     """The peer violated this protocol."""
@@ -58,6 +61,11 @@ def run_dir() -> str:
 def hooks_socket() -> str:
     """Where the sidecar listens for hooks."""
     return os.path.join(run_dir(), "hooks.sock")
+
+
+def starting_lock() -> str:
+    """A file that a sidecar has locked, with flock(2), from the first moment on; it listens a second later."""
+    return os.path.join(run_dir(), "starting")
 
 
 UNITS_IN_CONTAINER = "/run/avckpt-units"

@@ -188,6 +188,7 @@ def uninstall(root: Path, as_json: bool) -> None:
 )
 def sidecar(verbose: bool, config: Path, watchdog: bool) -> None:
     """Run the sidecar's daemon in the foreground (in its container, or as a service)."""
+    starting = _say_that_it_starts()  # noqa: F841 - open, and locked, as long as this process lives
     import logging
 
     logging.basicConfig(
@@ -205,6 +206,24 @@ def sidecar(verbose: bool, config: Path, watchdog: bool) -> None:
         # Podman starts its container again at once, for ever (--restart=always).
         time.sleep(START_AGAIN_S)
     sys.exit(status)
+
+
+def _say_that_it_starts() -> int:
+    """Locks `starting_lock()`, shared: whoever starts a container now waits a moment for this sidecar.
+
+    Whoever cannot do that has no need of it, or is told why when it serves.  Returns the descriptor, or -1.
+    """
+    import fcntl
+
+    from avckpt_hooks.shared import protocol
+
+    try:
+        os.makedirs(protocol.run_dir(), mode=0o755, exist_ok=True)
+        fd = os.open(protocol.starting_lock(), os.O_RDONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return -1
+    return fd
 
 
 def _serve(config: Path, beat_fd: int) -> int:

@@ -28,7 +28,7 @@ def remove(root: Path, run_dir: Path) -> list[Path]:
     with _no_sidecar(folder) as alone:
         if not alone:
             return []
-        for name in (*_FILES, *_SOCKETS, *(f"{each}/*.json" for each in _FOLDERS), "lock"):
+        for name in (*_FILES, *_SOCKETS, *(f"{each}/*.json" for each in _FOLDERS), "starting", "lock"):
             for path in folder.glob(name):
                 removed += _unlink(path, socket=name in _SOCKETS)
         removed += [path for each in (*_FOLDERS, CORES, "") for path in _rmdir(folder / each)]
