@@ -299,6 +299,17 @@ def test_down_of_what_is_not_there(path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert done == ["down"]
 
 
+def test_files_of_both_kinds_are_not_one_manifest(tmp_path: Path) -> None:
+    """The labels of the pods were passed over."""
+    pod, compose = tmp_path / "pod.yaml", tmp_path / "vehicle.yaml"
+    pod.write_text("apiVersion: v1\nkind: Pod\nmetadata: {annotations: {avckpt.enabel: 'true'}}\n")
+    compose.write_text("services: {node: {image: node}}\n")
+    for files in ((pod, compose), (compose, pod)):
+        status, said = avckpt("check", *map(str, files))
+        assert status == 1
+        assert said == f"avckpt: {pod} is for Kubernetes, and {compose} is not: check them one after the other\n"
+
+
 def test_what_must_be_process_1_is_worth_a_warning(path: Path) -> None:
     manifest = checked(
         path,

@@ -61,7 +61,14 @@ def check(files: tuple[Path, ...], more: tuple[Path, ...], is_config: bool, as_j
 @profiles_option
 @env_file_option
 @click.option("--install", "install_hooks", is_flag=True, help="Install the hooks if they are missing.")
-@click.option("--wait", "wait_s", type=click.FloatRange(min=0), default=30.0, show_default=True, help="Seconds.")
+@click.option(
+    "--wait",
+    "wait_s",
+    type=click.FloatRange(min=0),
+    default=30.0,
+    show_default=True,
+    help="Seconds.",
+)
 @click.option("--json", "as_json", is_flag=True, help="The containers as JSON.")
 @click.argument("services", nargs=-1)
 def up(
@@ -167,11 +174,15 @@ def down(
 
 
 def check_manifest(files: Sequence[Path], as_json: bool) -> ExitCode:
-    """Checks Compose files that belong together.  Raises ConfigError when none is named and none is here."""
+    """Checks files that belong together.  Raises ConfigError when none is named and none is here, or both kinds."""
     from avckpt.cli.compose import manifest, pods
 
     paths = manifest.files_meant(files, os.environ)
-    found = pods.check(paths) if all(map(pods.is_pods, paths)) else manifest.check(paths)
+    of_pods = [path for path in paths if pods.is_pods(path)]
+    others = [path for path in paths if path not in of_pods]
+    if of_pods and others:
+        raise ConfigError(f"{of_pods[0]} is for Kubernetes, and {others[0]} is not: check them one after the other")
+    found = pods.check(paths) if of_pods else manifest.check(paths)
     if as_json:
         click.echo(json.dumps(found.to_json(), indent=2))
     else:
