@@ -291,7 +291,11 @@ class Daemon:
                 changed = tuple(change for change in changed if change.setting in ("group", "notify"))
             if not changed:
                 return None
-            config = dataclasses.replace(after.config, memory_limit_bytes=container.config.memory_limit_bytes)
+            config = dataclasses.replace(
+                after.config,
+                memory_limit_bytes=container.config.memory_limit_bytes,
+                tasks_max=container.config.tasks_max,
+            )
             config = self._with_share(container, config, after.config)
             if watch.guard is not None:
                 watch.guard.configure(config)

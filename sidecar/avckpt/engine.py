@@ -234,6 +234,7 @@ def _config(init_pidfd: int, config: GuardConfig) -> Any:
     c.restore_window_ns = _ns("restore window", config.restore_window_s)
     c.shm_bytes = config.shm_bytes
     c.memory_limit_bytes = config.memory_limit_bytes
+    c.tasks_max = config.tasks_max
     c.deadline_ns = _ns("deadline", config.deadline_s)
     c.remains_ns = _ns("time for remains", config.remains_s)
     c.restore_max = config.restore_max

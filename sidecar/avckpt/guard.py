@@ -120,6 +120,8 @@ class GuardConfig:
     """Shared memory of the application's own that is rolled back with it, at most."""
     memory_limit_bytes: int = 0
     """Of the container, with swap; 0: none known."""
+    tasks_max: int = 0
+    """Of the container (its pids limit); 0: none known."""
     deadline_s: float = 0.0
     """A restore that takes longer than this after the death is abandoned; 0: none is."""
     remains_s: float = 0.0

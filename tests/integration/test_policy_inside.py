@@ -245,8 +245,9 @@ def test_a_container_that_has_ended(container: ContainerFactory, inside: Callabl
 
 
 def test_its_groups(container: ContainerFactory) -> None:
-    made = container("sleep", "1000", options=["--memory", "64m"])
+    made = container("sleep", "1000", options=["--memory", "64m", "--pids-limit", "65"])
     groups = groups_of(made.pid)
+    assert groups.tasks_max() == 65
     assert groups.memory_limit_bytes() == 64 << 20
     used = groups.memory_used_bytes()
     assert used is not None

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import signal
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from testkit.family import kill_main
-from testkit.guarded import GuardProcess, Victim, config
+from testkit.guarded import BUILD, GuardProcess, Victim, config
 from testkit.harness import SLOWNESS, wait_until
 from testkit.procfs import peak_kb
 
@@ -21,6 +22,7 @@ pytestmark = pytest.mark.shared_machine(
 )
 
 CHILDREN = 40
+USER = 54322 + os.getpid()  # who has no other processes
 PATIENCE_S = 30.0 * SLOWNESS
 
 
@@ -112,6 +114,43 @@ def test_templates_that_nobody_has_reaped_are_not_counted(tmp_path: Path) -> Non
         finally:
             os.kill(crowd.pid, signal.SIGCONT)
         crowd.wait_beats()
+
+
+@pytest.mark.parametrize(("limit", "fits"), [(250, True), (110, True), (90, False)])
+def test_a_limit_of_tasks_is_left_to_the_application(limit: int, fits: bool, tmp_path: Path) -> None:
+    """A quarter of what it leaves free stays free; where there is no room for templates, nothing is begun."""
+    processes = 20
+    most = (limit - processes - 2) * 3 // 4  # it has a main process, and init
+    with (
+        Victim(f"crowd shared {processes} 0", tmp_path) as crowd,
+        GuardProcess(config(tasks_max=limit, freeze_deadline_s=1.0), [crowd.pid]) as guard,
+    ):
+        for _ in range(4):
+            told = guard.checkpoint()
+            assert told["kind"] == ("checkpoint" if fits else "unprotected"), told
+        if not fits:
+            assert f"may have {limit} tasks" in told["error"]["message"]
+            most = 0
+        wait_until(lambda: len(crowd.others()) <= most, PATIENCE_S, "those that were killed have ended")
+        if fits:
+            since = guard.mark()
+            kill_main(crowd)
+            guard.wait("restored", since=since, timeout_s=PATIENCE_S)
+        crowd.wait_beats()
+
+
+def test_a_checkpoint_that_finds_no_room_leaves_none_of_its_tasks() -> None:
+    """The limit of its user, which avckpt does not know beforehand: holders would take what it still has."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.chmod(folder, 0o777)  # the victim is not root
+        user = f"/usr/bin/setpriv --reuid {USER} --regid {USER} --clear-groups --bounding-set -all --inh-caps -all"
+        command = f"{user} /usr/bin/prlimit --nproc=30:30 {BUILD / 'crowd'} shared 20 0"
+        with Victim(command, Path(folder)) as crowd, GuardProcess(config(), [crowd.pid]) as guard:
+            for _ in range(3):
+                answer = guard.command("checkpoint", timeout_s=PATIENCE_S)
+                assert answer["kind"] == "missed", answer
+            wait_until(lambda: not crowd.others(), PATIENCE_S, "nothing of ours is left")
+            crowd.wait_beats()
 
 
 def most_are_taken(guard: GuardProcess, tries: int) -> list[str]:

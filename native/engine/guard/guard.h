@@ -9,6 +9,7 @@
  *   guard_death.c       what follows a death
  *   guard_group.c       ... together with others
  *   guard_memory.c      which of its processes the OOM killer takes first
+ *   guard_tasks.c       how many of its container's tasks may be ours
  *   guard_pace.c        when the next checkpoint is worth its cost
  *   filter.c            its own seccomp filter
  *   thread_events.c     perf events of all threads of the app
@@ -221,6 +222,12 @@ bool guard_app_is_full(const struct avc_guard *guard);
 /* Whether there is memory for copies: what templates then have of their own must fit into the
  * container's limit, beside the app; without one, into a part of what the host has available. */
 bool guard_has_room_for_copies(const struct avc_guard *guard);
+
+/* ---- guard_tasks.c --------------------------------------------------------- */
+
+/* After tree_scan(), and before any process is given a holder: gives up what another checkpoint leaves
+ * no room for.  -1: that is not enough. */
+int guard_make_room_for_tasks(struct avc_guard *guard, struct avc_error *err) warn_unused;
 
 /* ---- guard_checkpoint.c ---------------------------------------------------- */
 

@@ -26,12 +26,17 @@
 
 /* ---- checkpoint --------------------------------------------------------------- */
 
+static void let_go_of_holders(struct avc_guard *guard)
+{
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		process_unhold(guard->tree.process[i]);
+}
+
 /* The app cannot be protected as it is: reports that once, and drops everything. */
 void guard_unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error)
 {
 	guard_drop_all(guard);
-	for (uint32_t i = 0; i < guard->tree.processes; i++)
-		process_unhold(guard->tree.process[i]);
+	let_go_of_holders(guard);
 	if (!guard->unprotected || ticket)
 		guard_emit_error(guard, AVC_EVENT_UNPROTECTED, ticket, error);
 	guard->unprotected = true;
@@ -239,7 +244,7 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 	tree->init = guard->channel.init;
 	tree->slots = guard->config.keep + 1;
 	(void)guard_let_executed_go(guard, true);
-	if (tree_scan(tree, err) || check_vfork(tree, err))
+	if (tree_scan(tree, err) || check_vfork(tree, err) || guard_make_room_for_tasks(guard, err))
 		return -1;
 	for (uint32_t i = 0; i < tree->count; i++) {
 		struct process *process = tree->entry[i].process;
@@ -726,6 +731,12 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		return;
 	}
 	try_soon(guard);
+	/* At a limit of its own (RLIMIT_NPROC) the app needs them more, and each attempt makes clone(2)
+	 * fail for it. */
+	if (error.code == AVC_LIMIT && !guard->count) {
+		let_go_of_holders(guard);
+		guard->next_ns = policy_refused(&guard->policy, guard->next_ns, now_ns());
+	}
 	event.kind = AVC_EVENT_MISSED;
 	event.generations = guard->count; /* with a new parasite, all may have been dropped */
 	event.ticket = ticket;

@@ -23,6 +23,7 @@ void guard_take_config(struct avc_guard *guard, const struct avc_config *config)
 {
 	const uint32_t keep = guard->config.keep;
 	const uint8_t suspends = guard->config.suspends;
+	const uint64_t tasks_max = guard->config.tasks_max;
 
 	guard_set_config(guard, config);
 	guard->config.suspends = suspends;
@@ -30,6 +31,9 @@ void guard_take_config(struct avc_guard *guard, const struct avc_config *config)
 	while (guard->count > guard->policy.room)
 		guard_drop_generation(guard, policy_dispensable(&guard->policy));
 	guard_rank_generations(guard);
+	/* It may not have to be refused any more. */
+	if (config->tasks_max != tasks_max)
+		policy_retry(&guard->policy);
 	if (guard->attached)
 		guard->next_ns = policy_due_again(config, guard->next_ns, now_ns());
 }

@@ -106,6 +106,7 @@ struct avc_config {
 	uint64_t remains_ns;            /* how long a dead app's memory is kept for
 	                                 * whoever looks at it; 0: it is not      */
 	uint64_t memory_limit_bytes;    /* of the container, with swap; 0: none known */
+	uint64_t tasks_max;             /* of the container; 0: none known            */
 	uint8_t restore_on_signal;      /* killed by an unrequested signal */
 	uint8_t restore_on_exit;        /* any non-zero exit status                  */
 	uint8_t files;                  /* enum avc_files                            */

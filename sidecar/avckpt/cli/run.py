@@ -97,7 +97,7 @@ def run(settings: Settings, argv: list[str], *, verbose: bool) -> int:
             )
 
     def watch(pid: int, supervisor: Supervisor) -> None:
-        supervisor.watch(replace(settings.config, memory_limit_bytes=memory_limit_bytes(pid), remains_s=0.0))
+        supervisor.watch(limited(replace(settings.config, remains_s=0.0), pid))
 
     return _run(argv, Supervisor, watch, verbose, io_uring)
 
@@ -124,12 +124,13 @@ def _run(argv: list[str], kind: type[S], watch: Callable[[int, S], None], verbos
     return os.WEXITSTATUS(status) if os.WIFEXITED(status) else 128 + os.WTERMSIG(status)
 
 
-def memory_limit_bytes(pid: int) -> int:
-    """Of its control groups, with swap; 0: none."""
+def limited(config: GuardConfig, pid: int) -> GuardConfig:
+    """With the limits of its control groups."""
     try:
-        return groups_of(pid).memory_and_swap_bytes() or 0
+        groups = groups_of(pid)
     except OSError:  # it has just ended
-        return 0
+        return config
+    return replace(config, memory_limit_bytes=groups.memory_and_swap_bytes() or 0, tasks_max=groups.tasks_max() or 0)
 
 
 class Supervisor:

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from avckpt.budget import CpuBudget
-from avckpt.cli.run import Job, Supervisor, memory_limit_bytes, say
+from avckpt.cli.run import Job, Supervisor, limited, say
 from avckpt.containers import units
 from avckpt.containers.process import has_ended, pid_of, status
 from avckpt.containers.strangers import let_go, receive
@@ -149,7 +149,7 @@ class NodesSupervisor(Supervisor):
             raise Busy(f"there are {units.UNITS_MOST} units already")
         config = settings_of(units.labels_of_node(claim.labels, self._labels)).config
         cookie = next(self._cookies)
-        config = replace(config, memory_limit_bytes=memory_limit_bytes(peer.pid), remains_s=0.0)
+        config = limited(replace(config, remains_s=0.0), peer.pid)
         share = self._cpu.share(cookie, config, time.monotonic())
         guard = self._engine.start_guard(peer.pidfd, replace(config, budget_cpu=share), cookie)
         name = units.unique_name(claim.name, [node.name for node in self._nodes.values()])

@@ -84,6 +84,8 @@ class Groups:
     freezers: tuple[Path, ...]
     """Of both versions, where there are both."""
     memory_version: int = 2
+    pids: Path | None = None
+    """Where its tasks are counted."""
 
     @property
     def procs(self) -> list[Path]:
@@ -132,6 +134,17 @@ class Groups:
                 room.append(limit - used)
         return min(room)
 
+    def tasks_max(self) -> int | None:
+        """How many there may be, in this group and in those above; None: any number."""
+        limits = []
+        for folder in (self.pids, *self.pids.parents) if self.pids else ():
+            if not (folder / "cgroup.procs").exists():
+                break
+            text = _read(folder / "pids.max")
+            if text.isdecimal():
+                limits.append(int(text))
+        return min(limits, default=None)
+
     def is_frozen(self) -> bool:
         """Whether it is paused (podman pause)."""
         return any(
@@ -144,7 +157,7 @@ class Groups:
 def groups_of(pid: int) -> Groups:
     """The groups of `pid` that can be seen.  Raises OSError when the process is gone."""
     directories: list[Path] = []
-    memory = unified = None
+    memory = pids = unified = None
     freezers: list[Path] = []
     version = 2
     # Read once: a busy host has hundreds of mounts, and version 1 a dozen groups for each process.
@@ -161,11 +174,13 @@ def groups_of(pid: int) -> Groups:
             freezers.append(directory)
         if "memory" in controllers:
             memory, version = directory, 1
+        if "pids" in controllers:
+            pids = directory
         if "freezer" in controllers:
             freezers.append(directory)
     if memory is None and unified is not None and (unified / "memory.max").exists():
         memory = unified
-    return Groups(tuple(directories), memory, tuple(freezers), version)
+    return Groups(tuple(directories), memory, tuple(freezers), version, pids or unified)
 
 
 def is_paused(pid: int) -> bool:

@@ -78,7 +78,7 @@ class Caretaker(Generic[W]):
             groups = Groups((), None, ())
         care = self._cares[ward.container.cookie] = _Care(ward, groups)
         care.oom_group = oom_group_of(groups, ward.container, ward.pidfd)
-        self._tell_limit(care, care.groups.memory_used_bytes())
+        self._tell_limits(care, care.groups.memory_used_bytes())
         if policy.restore_on.unhealthy:
             self._watch_health(care)
         self._look_if_needed()
@@ -157,7 +157,7 @@ class Caretaker(Generic[W]):
                     continue
                 limit = care.groups.memory_limit_bytes()
                 used = None if limit is None else care.groups.memory_used_bytes()
-                self._tell_limit(care, used)
+                self._tell_limits(care, used)
                 advice = await self._advise(care, limit, used)
                 if advice is Advice.DROP_OLDEST:
                     self._order(care, Command.DROP_OLDEST)
@@ -171,14 +171,18 @@ class Caretaker(Generic[W]):
         held = await held_by(container) if care.allowance.near_limit(used, limit) else 0
         return care.allowance.advise(used, limit, held, container.generations, now_s())
 
-    def _tell_limit(self, care: _Care[W], used: int | None) -> None:
-        """Its guard ranks generations by it.  It can change at any time: by `podman update --memory`, or when
+    def _tell_limits(self, care: _Care[W], used: int | None) -> None:
+        """Its guard ranks generations by that of memory.  They can change at any time: by `podman update`, or when
         memory runs out elsewhere first."""
         container, guard = care.ward.container, care.ward.guard
-        limit = care.groups.first_to_run_out_bytes(used) or 0
-        if guard is None or limit == container.config.memory_limit_bytes:
+        config = replace(
+            container.config,
+            memory_limit_bytes=care.groups.first_to_run_out_bytes(used) or 0,
+            tasks_max=care.groups.tasks_max() or 0,
+        )
+        if guard is None or config == container.config:
             return
-        container.config = replace(container.config, memory_limit_bytes=limit)
+        container.config = config
         with contextlib.suppress(TargetGone, Busy):  # it has ended
             guard.configure(container.config)
 
