@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 import sys
 
 from avckpt_hooks import VERSION, podman
@@ -90,9 +91,9 @@ def rewrite(config: bytes, parent: int) -> bytes:
     return rewrite_labelled(config, container, spec, parent)
 
 
-def rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) -> bytes:
+def rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int, bundle: str = "") -> bytes:
     """The same, of a container whose name and labels are in `spec`. `parent` 0: there is no Podman
-    (runtime.py)."""
+    (runtime.py), and the path of the root file system may be relative to `bundle`."""
     import json
 
     from avckpt_hooks.shared import labels
@@ -123,12 +124,12 @@ def rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) ->
         data["annotations"] = annotations
         add_hooks(data, told=True)
         return json.dumps(data, separators=(",", ":")).encode()
-    reason = _unprotectable(data, container, policy.scope)
+    # The hook is in two directories.
+    if any(map(_is_init, data.get("mounts") or [])):
+        return config
+    reason = _unprotectable(data, container, policy.scope) or _occupied(data, bundle, policy.scope)
     if reason:
         warn(f"container {name} runs unprotected: {reason}", parent)
-        return config
-    # The hook is in two directories.
-    if data["process"]["args"][0] == INIT_PATH or INIT_PATH in map(_destination, data.get("mounts") or []):
         return config
     told = _tell_if_alone(name, parent)
     if policy.scope == "nodes":
@@ -271,8 +272,44 @@ def warn(line: str, parent: int) -> bool:
     return tell.parent(line, parent) and not podman.is_service(parent)
 
 
-def _destination(mount: dict[str, Any]) -> object:
-    return mount.get("destination")
+def _is_init(mount: dict[str, Any]) -> bool:
+    return mount.get("destination") == INIT_PATH and os.path.basename(mount.get("source") or "") == "avckpt-init"
+
+
+def _occupied(data: dict[str, Any], bundle: str, scope: str) -> str:
+    """What the container itself has where we mount something; "" if there is nothing.
+
+    It would be hidden, or mounted over where a link leads; or the runtime could not mount anything
+    there, and the container would not start.
+    """
+    from avckpt_hooks.shared import protocol
+
+    if _has(data, bundle, INIT_PATH, stat.S_IFREG):
+        return f"it has a {INIT_PATH} of its own"
+    if scope == "nodes" and _has(data, bundle, protocol.UNITS_IN_CONTAINER, stat.S_IFDIR):
+        return f"it has a {protocol.UNITS_IN_CONTAINER} of its own"
+    return ""
+
+
+def _has(data: dict[str, Any], bundle: str, path: str, kind: int) -> bool:
+    """Whether there is anything but an empty file, or a directory, which an earlier start may have left."""
+    folder, name = os.path.split(path)
+    root = os.path.join(bundle, (data.get("root") or {}).get("path") or "")
+    where = f"{root}{folder}"
+    for mount in data.get("mounts") or []:
+        at = os.path.normpath(mount.get("destination") or "")
+        if at == path:
+            return True
+        if at == folder:
+            # Of a new tmpfs (--read-only) the source is no path.
+            where = str(mount.get("source") or "")
+    if not os.path.isabs(where) or os.path.islink(where):
+        return False
+    try:
+        found = os.lstat(f"{where}/{name}")
+    except OSError:
+        return False
+    return stat.S_IFMT(found.st_mode) != kind or (kind == stat.S_IFREG and found.st_size > 0)
 
 
 def _unprotectable(data: dict[str, Any], container: str, scope: str) -> str:

@@ -114,7 +114,8 @@ def _rewrite(path: str, container: str) -> None:
         if number:
             data["annotations"] = {"org.opencontainers.image.stopSignal": number, **annotations}
     before = json.dumps(data).encode()
-    after = precreate.rewrite_labelled(before, key, json.dumps(about).encode(), 0)
+    bundle = os.path.abspath(os.path.dirname(path))
+    after = precreate.rewrite_labelled(before, key, json.dumps(about).encode(), 0, bundle)
     if after == before:
         return
     data = json.loads(after)

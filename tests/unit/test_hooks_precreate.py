@@ -175,6 +175,75 @@ def test_a_second_time_changes_nothing(hook: Hook) -> None:
     assert hook(once, spec).out == once
 
 
+def make_directory(path: Path) -> None:
+    path.mkdir()
+
+
+def make_file(path: Path) -> None:
+    path.write_text("its own")
+
+
+def make_link(path: Path) -> None:
+    path.symlink_to("/etc/passwd")
+
+
+def make_loop(path: Path) -> None:
+    path.symlink_to(path.name)
+
+
+def make_fifo(path: Path) -> None:
+    os.mkfifo(path)
+
+
+@pytest.mark.parametrize("make", [make_directory, make_file, make_link, make_loop, make_fifo])
+@pytest.mark.parametrize("where", ["image", "volume"])
+def test_what_a_container_has_in_inits_place_stays_there(
+    hook: Hook, make: Callable[[Path], None], where: str, tmp_path: Path
+) -> None:
+    """Over a directory or an endless link the runtime can mount nothing; a link would lead to another file."""
+    config, spec = sample("labelled")
+    data = json.loads(config)
+    data["root"]["path"] = str(tmp_path / "root")
+    (tmp_path / "root" / "run").mkdir(parents=True)
+    (tmp_path / "volume").mkdir()
+    folder = tmp_path / "root" / "run"
+    if where == "volume":
+        make_directory(folder / "avckpt-init")  # which the volume hides
+        folder = tmp_path / "volume"
+        data["mounts"].append({"destination": "/run/", "type": "bind", "source": str(folder), "options": ["rbind"]})
+    config = json.dumps(data).encode()
+    # As it is after each earlier start.
+    (folder / "avckpt-init").touch()
+    assert hook(config, spec).config["process"]["args"][0] == "/run/avckpt-init"
+    (folder / "avckpt-init").unlink()
+    make(folder / "avckpt-init")
+    result = hook(config, spec)
+    assert result.out == config
+    assert "web runs unprotected: it has a /run/avckpt-init of its own" in result.said
+
+
+def test_what_is_mounted_in_inits_place_stays_there(hook: Hook) -> None:
+    config, spec = sample("labelled")
+    data = json.loads(config)
+    data["mounts"].append({"destination": "/run/avckpt-init", "type": "bind", "source": "/tmp", "options": ["rbind"]})
+    config = json.dumps(data).encode()
+    result = hook(config, spec)
+    assert result.out == config
+    assert "it has a /run/avckpt-init of its own" in result.said
+
+
+def test_a_launcher_with_something_in_the_place_of_its_units(hook: Hook, tmp_path: Path) -> None:
+    config, spec = sample("labelled")
+    data = json.loads(config)
+    data["root"]["path"] = str(tmp_path / "root")
+    (tmp_path / "root" / "run").mkdir(parents=True)
+    make_file(tmp_path / "root" / "run" / "avckpt-units")
+    config = json.dumps(data).encode()
+    result = hook(config, with_labels(spec, enable="true", scope="nodes"))
+    assert result.out == config
+    assert "it has a /run/avckpt-units of its own" in result.said
+
+
 def test_a_bad_label_fails_and_tells_the_one_who_started_podman(hook: Hook) -> None:
     config, spec = sample("labelled")
     result = hook(config, with_labels(spec, enable="true", interval="banana"))
