@@ -15,6 +15,12 @@ pytestmark = pytest.mark.shared_machine(
 )
 
 
+MOST = 60
+"""That are kept (docs/fidelity.md)."""
+OWN = 5
+"""Of the victim `timers`, without those that are asked for."""
+
+
 @pytest.fixture(autouse=True)
 def built(init_built: None, victims_built: Path) -> None:
     """avckpt-init and the victims."""
@@ -25,6 +31,24 @@ def built(init_built: None, victims_built: Path) -> None:
 def test_timers(command: str, where: str, tmp_path: Path) -> None:
     with Victim(f"{command} {where}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 60, (0.005, 0.1))
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_as_many_as_are_kept(where: str, tmp_path: Path) -> None:
+    with Victim(f"timers {MOST - OWN} {where}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        assert guard.checkpoint()["kind"] == "checkpoint"
+        since = guard.mark()
+        victim.kill_app()
+        guard.wait("restored", since=since)
+        victim.wait_beats()
+
+
+@pytest.mark.parametrize("many", [MOST - OWN + 1, 1000])
+def test_more_than_are_kept_are_told(many: int, tmp_path: Path) -> None:
+    with Victim(f"timers {many}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        taken = guard.checkpoint()
+        assert taken["kind"] == "checkpoint"
+        assert f"more than {MOST} POSIX timers" in taken["error"]["message"]
 
 
 @pytest.mark.parametrize("kind", ["alarm", "timer", "ticks"])

@@ -1,13 +1,13 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * timers: timers of every kind, which must go on ticking and keep their ids, signals,
+ * timers [MANY]: timers of every kind, which must go on ticking and keep their ids, signals,
  * values, threads and deadlines.
  *
  * - setitimer: ITIMER_REAL that ticks, ITIMER_PROF that ticks (this burns some CPU),
  *   ITIMER_VIRTUAL an hour ahead
  * - POSIX timers with gaps in their ids: one that ticks with a value, one to a thread
  *   (SIGEV_THREAD_ID), one on CPU time, one an hour ahead that was never due, one that
- *   was made and never set
+ *   was made and never set; and MANY like that
  */
 #include <pthread.h>
 #include <signal.h>
@@ -26,6 +26,7 @@ static volatile uint64_t last[KINDS];
 static volatile pid_t thread_tid;
 static int ids[5]; /* kernel's: posix, thread, cpu, hour, idle */
 static int deleted;
+static int many, more[1000];
 
 static void tick(int kind)
 {
@@ -148,6 +149,9 @@ static void check(uint64_t deadline)
 	asked = now_ns();
 	syscall(SYS_timer_gettime, ids[3], &spec);
 	check_left("a POSIX timer", spec.it_value.tv_sec, spec.it_value.tv_nsec, asked, deadline);
+	for (i = 0; i < many; i++)
+		CHECK(!syscall(SYS_timer_gettime, more[i], &spec), "timer %d is lost: %s", more[i],
+		      strerror(errno));
 	CHECK(syscall(SYS_timer_gettime, deleted, &spec) < 0 && errno == EINVAL,
 	      "timer %d is there again", deleted);
 }
@@ -169,7 +173,9 @@ int main(int argc, char **argv)
 	uint64_t deadline;
 	pthread_t thread;
 
-	victim_start(&argc, argv, 0, "");
+	victim_start(&argc, argv, 0, "[MANY]");
+	many = argc > 1 ? atoi(argv[1]) : 0;
+	must(many <= (int)(sizeof more / sizeof *more), "so many");
 	sigaction(SIGALRM, &act, NULL);
 	sigaction(SIGPROF, &act, NULL);
 	act = (struct sigaction){ .sa_sigaction = on_posix, .sa_flags = SA_RESTART | SA_SIGINFO };
@@ -190,6 +196,8 @@ int main(int argc, char **argv)
 	must(!syscall(SYS_timer_delete, deleted), "timer_delete");
 	ids[3] = make(CLOCK_BOOTTIME, SIGEV_SIGNAL, SIGUSR1, 0);
 	ids[4] = make(CLOCK_MONOTONIC, SIGEV_NONE, 0, 0);
+	for (i = 0; i < many; i++)
+		more[i] = make(CLOCK_MONOTONIC, SIGEV_SIGNAL, SIGRTMIN + 1, 0);
 	for (i = 0; i < KINDS; i++)
 		last[i] = now_ns();
 	set(ids[0], TICK_MS, TICK_MS);

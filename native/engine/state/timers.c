@@ -92,17 +92,20 @@ void timers_ask(struct process *process, struct inj_call *call)
 	struct timers *timers = process->timers;
 	const avc_remote out = parasite_remote(&process->parasite,
 					       process->parasite.control->timer);
+	size_t read = 0;
 	ssize_t n;
 
-	timers->count = 0;
 	for (int which = 0; which < ITIMERS; which++)
 		call_add(call, SYS_getitimer, (uint64_t)which,
 			 out + (uint64_t)which * sizeof(struct inj_timer));
-	n = pread(process->timers_fd, timers->text, sizeof timers->text - 1, 0);
-	if (n > 0) {
-		timers->text[n] = 0;
-		timers_parse(timers, timers->text);
-	}
+	/* The kernel gives a page at a time.  There is room for more than POSIX_MAX. */
+	do {
+		n = pread(process->timers_fd, timers->text + read, sizeof timers->text - 1 - read,
+			  (off_t)read);
+		read += n > 0 ? (size_t)n : 0;
+	} while (n > 0);
+	timers->text[read] = 0;
+	timers_parse(timers, timers->text);
 	for (uint32_t i = 0; i < timers->count; i++)
 		call_add(call, SYS_timer_gettime, (uint64_t)timers->posix[i].id,
 			 out + (ITIMERS + i) * sizeof(struct inj_timer));
