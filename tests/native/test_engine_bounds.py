@@ -14,7 +14,8 @@ import pytest
 
 from testkit.family import kill_main
 from testkit.guarded import BUILD, GuardProcess, Victim, config
-from testkit.harness import SLOWNESS, wait_until
+from testkit.harness import SLOWNESS, app_pid, wait_until
+from testkit.init_peer import Init
 from testkit.procfs import peak_kb
 
 pytestmark = pytest.mark.shared_machine(
@@ -265,6 +266,28 @@ def test_a_restore_of_many_descriptors_leaves_the_cpus_to_others(kind: str, how:
         assert urgent_s(guard.pid, lambda: guard.mark() > since + 1) < URGENT_S
         guard.wait("restored", since=since)
         horde.wait_beats()
+
+
+LOCKS = """
+import fcntl, sys, time
+file = open(sys.argv[1], "w")
+for byte in range(0, 16000, 2):
+    fcntl.lockf(file, fcntl.LOCK_EX, 1, byte)
+print("ready", file=file, flush=True)
+time.sleep(1000)
+"""
+
+
+def test_what_is_not_taken_again_is_told_by_its_name(tmp_path: Path) -> None:
+    """Here POSIX locks, which were told as watches of epoll."""
+    file = tmp_path / "file"
+    with Init(["/usr/bin/python3", "-c", LOCKS, file], pid1=True, options=("--wait-ms", "60000")) as init:
+        wait_until(lambda: file.exists() and file.read_text(), PATIENCE_S, "it has its locks")
+        with GuardProcess(config(freeze_deadline_s=1.0), [init.pid]) as guard:
+            assert guard.checkpoint()["kind"] == "checkpoint"
+            since = guard.mark()
+            os.kill(app_pid(init.pid), signal.SIGKILL)
+            assert "locks" in guard.wait("restored", since=since)["error"]["message"]
 
 
 def test_watches_that_cannot_be_told_apart_do_not_occupy_the_guard(tmp_path: Path) -> None:

@@ -260,7 +260,8 @@ void files_list_calls(struct files_work *work)
 	}
 	if (setup->full && !work->problems++)
 		fail(work->notes, AVC_UNSUPPORTED, 0, work->process->inside, "restore descriptors",
-		     "", "too many descriptors are watched by epoll; some are not any more");
+		     "",
+		     "it has too many watches of epoll, locks and listening sockets: not all are as they were");
 }
 
 void files_check_calls(const struct parasite *parasite, uint32_t slot, pid_t inside,
