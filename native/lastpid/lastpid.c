@@ -49,6 +49,9 @@
  * sleeping on it. Only for a while: on a busy machine the other side could not run. */
 #define SPINS 4000
 #define SLICE_NS 20000000
+/* To see that the number was used takes a system call each time. */
+#define LOOKS 50
+#define LOOK_NS 50000
 #define LIFE_S 60        /* the longest a restore may take; the helper exits then in any case */
 #define RT_MAX_US 200000 /* it has the guard's priority, and must not keep a CPU busy */
 
@@ -258,36 +261,44 @@ static int32_t write_last_pid(int32_t value)
 }
 
 /* Sleeps while *word == value, a slice at most. */
-static void sleep_on(uint32_t *word, uint32_t value)
+static void sleep_on(uint32_t *word, uint32_t value, int64_t ns)
 {
-	const int64_t slice[2] = { 0, SLICE_NS };
+	const int64_t slice[2] = { 0, ns };
 
 	raw_syscall(__NR_futex, (uint64_t)word, FUTEX_WAIT, value, (uint64_t)slice, 0, 0);
 }
 
 static void serve(void)
 {
-	int32_t before = 0;
+	int32_t before = 0, once = 0;
 	uint32_t spins = 0;
 
 	while (!__atomic_load_n(&page->stop, __ATOMIC_ACQUIRE)) {
 		const uint32_t serving = __atomic_load_n(&page->serving, __ATOMIC_ACQUIRE);
 		struct inj_slot *slot = slots[serving < slot_count ? serving : 0];
 		const uint32_t want = __atomic_load_n(&slot->want, __ATOMIC_ACQUIRE);
+		const bool asked = want != slot->have;
 
-		if (want != slot->have) {
-			if (slot->last_pid > 0) {
-				if (!before) /* at the first request the guard holds the lock */
-					before = read_last_pid();
-				page->error = write_last_pid(slot->last_pid);
-			}
+		if (asked && slot->last_pid > 0) {
+			if (!before) /* the guard holds the lock */
+				before = read_last_pid();
+			once = slot->once ? slot->last_pid : 0;
+			page->error = write_last_pid(slot->last_pid);
+		} else if (before > 0 && ((asked && slot->last_pid == INJ_LAST_PID_FREE) ||
+					  (once > 0 && read_last_pid() != once))) {
+			/* Others that fork are not to take the numbers after it: the next of the
+			 * dead may need them. */
+			write_last_pid(before);
+			before = once = 0;
+		}
+		if (asked) {
 			__atomic_store_n(&slot->have, want, __ATOMIC_RELEASE);
 			SYS(__NR_futex, &slot->have, FUTEX_WAKE, INT32_MAX);
 			spins = 0;
-		} else if (++spins < SPINS) {
+		} else if (++spins < (once ? LOOKS : SPINS)) {
 			cpu_relax();
 		} else {
-			sleep_on(&slot->want, want);
+			sleep_on(&slot->want, want, once ? LOOK_NS : SLICE_NS);
 		}
 	}
 	/* PIDs continue from where they were. Otherwise the next templates would get those of

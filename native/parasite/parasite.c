@@ -35,6 +35,8 @@
 #define ASK_SPINS 2000
 #define ASK_SLEEPS 500 /* as long as a step of a restore */
 #define ASK_SLEEP_MS 10
+#define ASK_ONCE_SLEEPS 100
+#define ASK_TRIES 4
 
 struct inj_timespec {
 	int64_t s, ns;
@@ -217,6 +219,48 @@ static void close_claims(uint64_t fd, uint64_t last)
 			SYS1(__NR_close, fd);
 }
 
+static uint32_t request_last_pid(struct inj_slot *slot, int32_t value, uint32_t once)
+{
+	uint32_t want;
+
+	slot->last_pid = value;
+	slot->once = once;
+	want = __atomic_add_fetch(&slot->want, 1, __ATOMIC_ACQ_REL);
+	futex_wake(&slot->want);
+	return want;
+}
+
+/* Returns 0, -ETIMEDOUT, or -EAGAIN: it has slept, and others may have taken the number meanwhile. */
+static long await_last_pid(struct inj_slot *slot, uint32_t want, uint32_t sleeps)
+{
+	uint32_t have;
+
+	for (uint32_t tries = 0; (have = __atomic_load_n(&slot->have, __ATOMIC_ACQUIRE)) != want;
+	     tries++) {
+		if (tries < ASK_SPINS) {
+			cpu_relax();
+			continue;
+		}
+		if (tries >= ASK_SPINS + sleeps)
+			return -110;
+		futex_wait(&slot->have, have, ASK_SLEEP_MS);
+		if (__atomic_load_n(&slot->have, __ATOMIC_ACQUIRE) == want)
+			return -EAGAIN_;
+	}
+	return 0;
+}
+
+/* Asks the engine's helper to set ns_last_pid, which the container may not. */
+static long ask_last_pid(struct inj_slot *slot, int32_t value, uint32_t once)
+{
+	const uint32_t sleeps = once ? ASK_ONCE_SLEEPS : ASK_SLEEPS;
+	long r = -EAGAIN_;
+
+	for (int i = 0; r == -EAGAIN_ && i < ASK_TRIES; i++)
+		r = await_last_pid(slot, request_last_pid(slot, value, once), sleeps);
+	return r == -EAGAIN_ ? 0 : r;
+}
+
 static void make_list(struct inj_syscall *s, uint64_t count)
 {
 	for (; count; count--, s++)
@@ -262,6 +306,9 @@ __attribute__((section(".text.entry"))) void inj_run(uint64_t result, struct inj
 			alone = !make_pause(call);
 		else if (s->nr == INJ_FUTURE_LOCK)
 			s->result = find_future_lock();
+		else if (s->nr == INJ_LAST_PID)
+			s->result = ask_last_pid((struct inj_slot *)s->arg[0], (int32_t)s->arg[1],
+						 1);
 		else if (s->nr == INJ_CAPS)
 			s->result = find_caps(s->arg[0], (const uint32_t *)s->arg[1]);
 		else if (s->nr == __NR_clone)
@@ -528,25 +575,6 @@ void inj_thread(struct inj_slot *slot, struct inj_thread *t)
 	inj_sigreturn(t->frame);
 }
 
-/* Asks the engine's helper to set ns_last_pid, which the container may not. */
-static void ask_last_pid(struct inj_slot *slot, int32_t value)
-{
-	uint32_t want, have;
-
-	slot->last_pid = value;
-	want = __atomic_add_fetch(&slot->want, 1, __ATOMIC_ACQ_REL);
-	futex_wake(&slot->want);
-	for (uint32_t tries = 0; (have = __atomic_load_n(&slot->have, __ATOMIC_ACQUIRE)) != want;
-	     tries++) {
-		if (tries < ASK_SPINS)
-			cpu_relax();
-		else if (tries < ASK_SPINS + ASK_SLEEPS)
-			futex_wait(&slot->have, have, ASK_SLEEP_MS);
-		else
-			fail(slot, INJ_STEP_TID, value + 1, -110);
-	}
-}
-
 static void spawn(struct inj_slot *slot, struct inj_thread *t, int32_t *last)
 {
 	const uint64_t flags = CLONE_VM | CLONE_FS | CLONE_FILES | CLONE_SIGHAND | CLONE_THREAD |
@@ -560,8 +588,8 @@ static void spawn(struct inj_slot *slot, struct inj_thread *t, int32_t *last)
 		 * for a CPU just then. */
 		if (i >= SPAWN_TRIES_AT_ONCE || tid < 0)
 			pause_us(SPAWN_PAUSE_US);
-		if (*last + 1 != t->tid)
-			ask_last_pid(slot, t->tid - 1);
+		if (*last + 1 != t->tid && (tid = ask_last_pid(slot, t->tid - 1, 0)))
+			fail(slot, INJ_STEP_TID, t->tid, tid);
 		tid = inj_spawn(flags, t->stack, t->tls, t, slot, t->tid);
 		/* At the limit of tasks one that has gone astray, and has yet to get a CPU for its
 		 * end, is one too many. */
@@ -581,7 +609,7 @@ static void spawn(struct inj_slot *slot, struct inj_thread *t, int32_t *last)
 __attribute__((section(".text.entry"))) void inj_restore(struct inj_slot *slot)
 {
 	struct inj_thread *me = thread_of(slot, 0);
-	int32_t last = me->tid;
+	int32_t last = -1;
 	long r;
 
 	if (slot->placed) {
@@ -609,6 +637,8 @@ __attribute__((section(".text.entry"))) void inj_restore(struct inj_slot *slot)
 	run_setup(slot, me->tid, slot->setup[INJ_BEFORE]);
 	for (uint32_t i = 1; i < slot->threads; i++)
 		spawn(slot, thread_of(slot, i), &last);
+	if (slot->threads > 1)
+		request_last_pid(slot, INJ_LAST_PID_FREE, 0);
 	say_spawned(slot);
 	set_up(slot, me);
 	if (__atomic_add_fetch(&slot->ready, 1, __ATOMIC_ACQ_REL) != slot->threads) {

@@ -66,6 +66,9 @@ struct inj_timer {
 /* Closes what is open from number arg[0] to arg[1], except what claims nothing that others could miss
  * at once: connections and sockets without a name, and pipes. */
 #define INJ_CLOSE_CLAIMS (-6)
+/* Asks the engine's helper for the next PID, arg[1] + 1, through the slot arg[0]: right before the clone
+ * that is to have it, because any fork in the namespace can take it. */
+#define INJ_LAST_PID (-7)
 
 enum inj_after {
 	INJ_AFTER_HOME = 0, /* go back to the interrupted context (struct inj_home) */
@@ -201,6 +204,9 @@ enum inj_step {
 	INJ_STEP_SETUP
 };
 
+/* No number is to be chosen any more: the namespace's PIDs continue from where they were. */
+#define INJ_LAST_PID_FREE (-1)
+
 /* A generation's restore, in the restored process. */
 struct inj_slot {
 	uint32_t state;   /* futex, enum inj_state                          */
@@ -212,7 +218,8 @@ struct inj_slot {
 	/* ns_last_pid, written by the engine's helper on request               */
 	uint32_t want;     /* incremented by R for each request              */
 	uint32_t have;     /* set to `want` by the helper                    */
-	int32_t last_pid;  /* the value R wants                              */
+	int32_t last_pid;  /* the value R wants, or INJ_LAST_PID_FREE        */
+	uint32_t once;     /* the number is for one clone, and then as FREE  */
 	int32_t error;     /* errno                                          */
 	uint32_t error_at; /* enum inj_step                                  */
 	int32_t error_tid;

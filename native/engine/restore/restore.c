@@ -132,19 +132,30 @@ static int fork_template(struct restore *restore, bool again, struct avc_error *
 	const bool spare = spare_is_there(generation);
 	const pid_t from = spare ? generation->spare.pid : image->template;
 	const struct arch_regs *base = spare ? &generation->spare.base : &image->base;
+	const struct inj_syscall *asked;
 	pid_t child = 0;
+	bool failed;
 
 	if (check_memory(generation, err))
 		return -1;
 	/* The first time there are calls of files_restore() before it. */
 	if (again)
 		call_begin(call, INJ_AFTER_PARK);
+	asked = last_pid_ask(restore->helper, parasite, call, slot->pid - 1);
 	call_add(call, SYS_clone, (spare ? CLONE_VM : 0) | CLONE_FILES | CLONE_PARENT | SIGCHLD);
-	if (parasite_send(parasite, from, base, call, err) ||
-	    parasite_run_clone(from, call, &child, err))
+	failed = parasite_send(parasite, from, base, call, err) ||
+		 parasite_run_clone(from, call, &child, err);
+	/* What comes next takes time, and others fork meanwhile: with the numbers after this one, which
+	 * may be those of the dead who are to come back next. */
+	last_pid_free(restore->helper);
+	if (failed)
 		return -1;
 	if (tracee_await(child, NULL, err) != STOP_TRAP)
 		return -1;
+	if (last_pid_answered(restore->helper, asked, err)) {
+		tracee_kill(child);
+		return -1;
+	}
 	close_fd(&restore->pidfd);
 	restore->pidfd = proc_pidfd_open(child);
 	if (restore->pidfd < 0) {
@@ -284,8 +295,6 @@ static int rebuild(struct restore *restore, struct avc_error *err)
 		reset(parasite, image->slot);
 		slot->astray = i > 0;
 		failed.code = AVC_OK;
-		if (last_pid_set(restore->helper, slot->pid - 1, err))
-			return -1;
 		if (fork_template(restore, i > 0, &failed)) {
 			/* At the limit of tasks the one with a wrong number is one too many, until
 			 * init has reaped it. */
@@ -417,14 +426,17 @@ static struct last_pid *start_helper(const struct generation *generation,
 	return helper;
 }
 
-/* The fork takes so long that another process could take the PID. */
+/* The fork takes so long that another process could take the PID; where units of one container fork and
+ * die together, any fork does. */
 static int make_spare_first(struct restore *restore, struct avc_error *err)
 {
 	struct generation *generation = restore->generation;
 	const uint64_t start = now_ns();
 	int result = spare_await(generation, err) || check_memory(generation, err) ? -1 : 0;
 
-	if (!result && generation->image[0].anon_pages >= COPIED_PAGES &&
+	if (!result &&
+	    (generation->image[0].anon_pages >= COPIED_PAGES ||
+	     restore->channel->numbers_fd >= 0) &&
 	    !generation->spare.unwanted && !spare_is_there(generation))
 		result = spare_make_now(generation, err);
 	restore->fork_ns = now_ns() - start;

@@ -16,7 +16,8 @@
 /* ---- restore.c ------------------------------------------------------------------ */
 
 /* A process that takes less than about a millisecond to fork gets its PID sooner or later, even
- * where others fork all the time.  One with more pages is copied first (spare.c). */
+ * where others fork all the time.  One with more pages is copied first (spare.c), and so is any where
+ * there are several guards. */
 #define COPIED_PAGES 16384
 
 /* Restores an app from a generation. */

@@ -247,6 +247,7 @@ static int give_birth(struct birth *birth, pid_t *child, struct avc_error *err)
 			restored->last_number = birth->number;
 			return birth->copy ? take_back(host, birth->copy, err) : 0;
 		}
+		last_pid_free(restore->helper);
 		if (made && !birth->copy && !birth->orphan) {
 			birth->copy = *child;
 			continue;

@@ -496,7 +496,6 @@ static int begin_main(struct restore_tree *restored, struct avc_error *err)
 		forked->group = status.group;
 	}
 	slot->placed = 1;
-	restored->last_number = slot->pid;
 	return 0;
 }
 

@@ -396,33 +396,68 @@ static bool await_word(const struct last_pid *helper, uint32_t *word, uint32_t w
 	return true;
 }
 
+static uint32_t request(struct inj_slot *slot, pid_t value)
+{
+	uint32_t want;
+
+	slot->last_pid = value;
+	slot->once = 0;
+	want = __atomic_add_fetch(&slot->want, 1, __ATOMIC_ACQ_REL);
+	wake(&slot->want);
+	return want;
+}
+
+static int fail_silent(struct avc_error *err)
+{
+	return fail(err, AVC_KERNEL, ETIMEDOUT, 0, "restore", "write(ns_last_pid)",
+		    "the helper does not answer (setns(2) into the container takes "
+		    "CAP_SYS_ADMIN and CAP_SYS_CHROOT)");
+}
+
+static int fail_refused(const struct last_pid *helper, struct avc_error *err)
+{
+	const int32_t error = __atomic_load_n(&helper->page->error, __ATOMIC_RELAXED);
+
+	return error ? fail(err, AVC_DENIED, error, 0, "restore", "write(ns_last_pid)",
+			    "the next PID cannot be chosen (CAP_CHECKPOINT_RESTORE or CAP_SYS_ADMIN "
+			    "is needed)")
+		     : 0;
+}
+
 int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err)
 {
 	struct inj_slot *slot = served(helper);
-	uint32_t want;
-	int32_t error;
+	const uint32_t want = request(slot, value);
 
-	slot->last_pid = value;
-	want = __atomic_add_fetch(&slot->want, 1, __ATOMIC_ACQ_REL);
-	wake(&slot->want);
 	if (!await_word(helper, &slot->have, want, tracee_deadline(NS_PER_S)))
-		return fail(err, AVC_KERNEL, ETIMEDOUT, 0, "restore", "write(ns_last_pid)",
-			    "the helper does not answer (setns(2) into the container takes "
-			    "CAP_SYS_ADMIN and CAP_SYS_CHROOT)");
-	error = __atomic_load_n(&helper->page->error, __ATOMIC_RELAXED);
-	if (error)
-		return fail(
-			err, AVC_DENIED, error, 0, "restore", "write(ns_last_pid)",
-			"the next PID cannot be chosen (CAP_CHECKPOINT_RESTORE or CAP_SYS_ADMIN is needed)");
-	return 0;
+		return fail_silent(err);
+	return fail_refused(helper, err);
 }
 
 /* It may be asleep on the word of the slot that it serves. When woken it has nothing to write. */
 static void rouse(struct inj_slot *slot)
 {
-	slot->last_pid = 0;
-	__atomic_add_fetch(&slot->want, 1, __ATOMIC_ACQ_REL);
-	wake(&slot->want);
+	(void)request(slot, 0);
+}
+
+const struct inj_syscall *last_pid_ask(const struct last_pid *helper,
+				       const struct parasite *parasite, struct inj_call *call,
+				       pid_t value)
+{
+	rouse(served(helper)); /* by then it is awake, and answers at once */
+	return call_add(call, INJ_LAST_PID, parasite_remote(parasite, served(helper)),
+			(uint64_t)value);
+}
+
+int last_pid_answered(const struct last_pid *helper, const struct inj_syscall *asked,
+		      struct avc_error *err)
+{
+	return asked->result ? fail_silent(err) : fail_refused(helper, err);
+}
+
+void last_pid_free(struct last_pid *helper)
+{
+	(void)request(served(helper), INJ_LAST_PID_FREE);
 }
 
 void last_pid_serve(struct last_pid *helper, struct inj_slot *slot)

@@ -745,6 +745,17 @@ struct last_pid *last_pid_start(int init_pidfd, const struct last_pid_slot *slot
 /* It lives for a minute, and may have failed. */
 bool last_pid_is_there(const struct last_pid *helper);
 int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err) warn_unused;
+/* Adds the request to a task's calls, before the clone(2) that is to have the next number: others that
+ * fork have less time to take it.  The task's parasite has the slot that is served.  When the calls were
+ * made, last_pid_answered() tells of the answer. */
+const struct inj_syscall *last_pid_ask(const struct last_pid *helper,
+				       const struct parasite *parasite, struct inj_call *call,
+				       pid_t value);
+int last_pid_answered(const struct last_pid *helper, const struct inj_syscall *asked,
+		      struct avc_error *err) warn_unused;
+/* No number is needed until the next request: who forks until then takes none near it.  Does not
+ * wait. */
+void last_pid_free(struct last_pid *helper);
 /* From now on serves requests of another slot. */
 void last_pid_serve(struct last_pid *helper, struct inj_slot *slot);
 /* Nothing is written any more: the namespace's PIDs continue from where they were. */
