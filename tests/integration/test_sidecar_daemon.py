@@ -434,6 +434,7 @@ def test_a_sidecar_that_does_not_see_the_hosts_processes_says_so(local: LocalSid
 def test_hooks_know_of_it_before_it_listens(idle_sidecar: LocalSidecar, monkeypatch: pytest.MonkeyPatch) -> None:
     """For a container that is started right after it."""
     monkeypatch.setenv("AVCKPT_RUN_DIR", str(idle_sidecar.run_dir))
+    idle_sidecar.run_dir.mkdir(exist_ok=True)  # as Podman does, for the volume
     start = threading.Thread(target=idle_sidecar.start)
     start.start()
     wait_until(precreate._is_starting, 60, "it says that it starts", every_s=0.005)

@@ -211,14 +211,13 @@ def sidecar(verbose: bool, config: Path, watchdog: bool) -> None:
 def _say_that_it_starts() -> int:
     """Locks `starting_lock()`, shared: whoever starts a container now waits a moment for this sidecar.
 
-    Whoever cannot do that has no need of it, or is told why when it serves.  Returns the descriptor, or -1.
+    Without that folder, which Podman mounts, there is nobody to wait.  Returns the descriptor, or -1.
     """
     import fcntl
 
     from avckpt_hooks.shared import protocol
 
     try:
-        os.makedirs(protocol.run_dir(), mode=0o755, exist_ok=True)
         fd = os.open(protocol.starting_lock(), os.O_RDONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError:
