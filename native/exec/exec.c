@@ -41,6 +41,8 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "program.h"
+
 #define FILTERS_MAX 32
 #define CGROUPS_MAX 32
 #define GROUPS_MAX 256
@@ -332,7 +334,7 @@ static _Noreturn void become_command(int gate)
 	for (int sig = 1; sig < NSIG; sig++)
 		signal(sig, SIG_DFL);
 	environ = job.env;
-	execvp(job.command[0], job.command);
+	program_execute(job.command);
 	dprintf(2, "%s: %s\n", job.command[0], strerror(errno));
 	_exit(errno == ENOENT ? EXIT_NOT_FOUND : EXIT_CANNOT_RUN);
 }

@@ -42,6 +42,7 @@
 #include "avckpt/ctl.h"
 #include "init.h"
 #include "keys.h"
+#include "program.h"
 
 #define NAME "avckpt-init"
 #define EXIT_USAGE 125 /* init's own failure, as for Podman */
@@ -264,7 +265,10 @@ static _Noreturn void become_app(char **argv)
 	}
 	sigaction(SIGCHLD, &self.chld, NULL);
 	mask_set(self.mask, NULL);
-	execvp(argv[0], argv);
+	if (self.is_unit)
+		execvp(argv[0], argv); /* as nice(1) and env(1) do */
+	else
+		program_execute(argv);
 	err = errno;
 	if (self.ctl)
 		__atomic_store_n(&self.ctl->exec_errno, err, __ATOMIC_RELEASE);

@@ -85,6 +85,29 @@ def test_program_not_executable(program: str) -> None:
         assert init.error_text() == f"avckpt-init: {program}: Permission denied\n"
 
 
+@pytest.mark.parametrize("text", ["exit 0\n", "", "\x7fELF"])
+@pytest.mark.parametrize("by_path", [False, True])
+def test_no_shell_reads_what_is_no_program(text: str, by_path: bool, tmp_path: Path) -> None:
+    """The runtime would not have run it, either."""
+    script = tmp_path / "script"
+    script.write_text(text)
+    script.chmod(0o755)
+    name = "script" if by_path else str(script)
+    path = f"/nowhere:/etc/passwd:{tmp_path}:{os.environ['PATH']}"
+    with Init([name], env={**os.environ, "PATH": path}) as init:
+        assert init.end() == 126
+        assert init.error_text() == f"avckpt-init: {name}: Exec format error\n"
+
+
+@pytest.mark.parametrize(
+    ("path", "status"), [("/nowhere:/bin", 0), ("", 127), (":/usr/bin", 0), (None, 0), ("/etc", 127)]
+)
+def test_programs_are_found_by_path(path: str | None, status: int) -> None:
+    env = {key: value for key, value in os.environ.items() if key != "PATH"} | ({} if path is None else {"PATH": path})
+    with Init(["true"], env=env) as init:
+        assert init.end() == status
+
+
 @pytest.mark.parametrize(
     "args",
     [
