@@ -464,7 +464,7 @@ def test_sigterm_leaves_the_application_running_and_nothing_else(local: LocalSid
     app = web.app_pid
     assert local.stop() == 0
     assert sorted(path.name for path in local.run_dir.iterdir()) == [
-        *("containers", "health", "history.jsonl", "lock", "present.json", "starting", "units")
+        *("containers", "health", "history.jsonl", "lock", "present.json", "units")
     ]
     assert not ended(web)
     # Templates are gone, the application is not traced any more and runs.

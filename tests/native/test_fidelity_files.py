@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 from avckpt.guard import Files, Tcp
 
+from testkit.family import ours
 from testkit.guarded import (
     PATIENCE_S,
     WHERE,
@@ -215,6 +216,7 @@ def test_strict_sees_files_that_are_not_open(how: str, why: str, tmp_path: Path,
         # Nothing was written yet.
         victim.kill_app()
         guard.wait("restored")
+        wait_until(lambda: ours(victim, "avckpt-hold"), PATIENCE_S, "without a holder what is mapped is not known")
         victim.kill_app(signal.SIGUSR1)
         wait_until(lambda: victim.see().counter[0] == 1, 10, "it has done it")
         since = guard.mark()

@@ -20,6 +20,7 @@
 
 static const char not_inits[] = "its control page is not one of avckpt-init's";
 
+#define EXIT_NS (10 * NS_PER_MS)
 #define LEFTOVERS_NS (100 * NS_PER_MS)
 /* On a busy machine a killed process may wait long for a CPU to exit. Until then it can consume
  * what is put back into a pipe: a read(2) that finds data does not check for signals. */
@@ -192,7 +193,8 @@ int init_channel_open(struct init_channel *channel, struct avc_error *err)
 		return 1;
 	init_channel_close(channel);
 	channel->init_pidfd = pidfd;
-	return -1;
+	/* Who exits closes his descriptors first, and is not to be told to run unprotected. */
+	return pidfd_await_end(pidfd, EXIT_NS) ? 0 : -1;
 }
 
 /* Everything but the pidfd, which belongs to the guard. */
