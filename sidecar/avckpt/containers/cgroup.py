@@ -12,6 +12,7 @@ import contextlib
 import ctypes
 import logging
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -126,9 +127,7 @@ class Groups:
         """The smallest amount left in a group above, or on the host."""
         fields = _host_memory()
         room = [fields["MemAvailable"] + fields["SwapFree"]]
-        for folder in self.memory.parents if self.memory else ():
-            if not (folder / "cgroup.procs").exists():
-                break
+        for folder in _upwards(self.memory.parent) if self.memory else ():
             limit, used = _limit_bytes(folder, self.memory_version), _used_bytes(folder, self.memory_version)
             if limit is not None and used is not None:
                 room.append(limit - used)
@@ -136,14 +135,8 @@ class Groups:
 
     def tasks_max(self) -> int | None:
         """How many there may be, in this group and in those above; None: any number."""
-        limits = []
-        for folder in (self.pids, *self.pids.parents) if self.pids else ():
-            if not (folder / "cgroup.procs").exists():
-                break
-            text = _read(folder / "pids.max")
-            if text.isdecimal():
-                limits.append(int(text))
-        return min(limits, default=None)
+        texts = [_read(folder / "pids.max") for folder in _upwards(self.pids)] if self.pids else []
+        return min((int(text) for text in texts if text.isdecimal()), default=None)
 
     def is_frozen(self) -> bool:
         """Whether it is paused (podman pause)."""
@@ -152,6 +145,14 @@ class Groups:
             or "frozen 1" in _read(freezer / "cgroup.events").splitlines()
             for freezer in self.freezers
         )
+
+
+def _upwards(group: Path) -> Iterator[Path]:
+    """This one, and those above it that can be seen."""
+    for folder in (group, *group.parents):
+        if not (folder / "cgroup.procs").exists():
+            return
+        yield folder
 
 
 def groups_of(pid: int) -> Groups:
