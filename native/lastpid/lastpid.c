@@ -260,7 +260,7 @@ static int32_t write_last_pid(int32_t value)
 	return r < 0 ? (int32_t)-r : 0;
 }
 
-/* Sleeps while *word == value, a slice at most. */
+/* Sleeps while *word == value, so long at most. */
 static void sleep_on(uint32_t *word, uint32_t value, int64_t ns)
 {
 	const int64_t slice[2] = { 0, ns };

@@ -30,12 +30,13 @@
 #define SPAWN_TRIES_AT_ONCE 8
 #define SPAWN_PAUSE_US 100
 #define EAGAIN_ 11
+#define ETIMEDOUT_ 110
 
 /* For the answer of the engine's helper, which is fast when it has a CPU. */
 #define ASK_SPINS 2000
 #define ASK_SLEEPS 500 /* as long as a step of a restore */
 #define ASK_SLEEP_MS 10
-#define ASK_ONCE_SLEEPS 100
+#define ASK_ONCE_SLEEPS 100 /* as long as the engine waits for an answer of its own */
 #define ASK_TRIES 4
 
 struct inj_timespec {
@@ -242,7 +243,7 @@ static long await_last_pid(struct inj_slot *slot, uint32_t want, uint32_t sleeps
 			continue;
 		}
 		if (tries >= ASK_SPINS + sleeps)
-			return -110;
+			return -ETIMEDOUT_;
 		futex_wait(&slot->have, have, ASK_SLEEP_MS);
 		if (__atomic_load_n(&slot->have, __ATOMIC_ACQUIRE) == want)
 			return -EAGAIN_;
@@ -555,7 +556,7 @@ static void wait_for_go(struct inj_slot *slot, enum inj_go stage, const struct i
 	uint32_t go;
 
 	while ((go = __atomic_load_n(&slot->go, __ATOMIC_ACQUIRE)) < stage) {
-		if (futex_wait(&slot->go, go, INJ_GO_S * 1000) == -110 /* ETIMEDOUT */)
+		if (futex_wait(&slot->go, go, INJ_GO_S * 1000) == -ETIMEDOUT_)
 			leave();
 	}
 	/* Set with `go`. */

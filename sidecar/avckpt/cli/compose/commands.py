@@ -61,14 +61,7 @@ def check(files: tuple[Path, ...], more: tuple[Path, ...], is_config: bool, as_j
 @profiles_option
 @env_file_option
 @click.option("--install", "install_hooks", is_flag=True, help="Install the hooks if they are missing.")
-@click.option(
-    "--wait",
-    "wait_s",
-    type=click.FloatRange(min=0),
-    default=30.0,
-    show_default=True,
-    help="Seconds.",
-)
+@click.option("--wait", "wait_s", type=click.FloatRange(min=0), default=30.0, show_default=True, help="Seconds.")
 @click.option("--json", "as_json", is_flag=True, help="The containers as JSON.")
 @click.argument("services", nargs=-1)
 def up(
