@@ -10,14 +10,17 @@ import select
 import signal
 import subprocess
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 from avckpt.cli.client import Client, Json
-from avckpt.cli.top import COLUMNS, Top, sparkline
+from avckpt.cli.top import COLUMNS, Ask, Top, sparkline
+from avckpt.guard import Command
 from rich.text import Text
 from textual.pilot import Pilot
-from textual.widgets import DataTable, RichLog
+from textual.widgets import DataTable, Label, RichLog
 
 from testkit.harness import avckpt_command, take_checkpoint, wait_until
 from testkit.local_sidecar import ON_COMMAND, LocalSidecar
@@ -130,28 +133,122 @@ def test_only_what_has_changed_is_painted(local: LocalSidecar, monkeypatch: pyte
     driven(local, steps)
 
 
-@pytest.mark.shared_machine("a screen is given a time to show what it should")
-def test_on_a_terminal(local: LocalSidecar) -> None:
+@pytest.mark.shared_machine("restores and screens on a busy machine may take longer than the test waits")
+def test_what_is_said_fits_the_screen(local: LocalSidecar) -> None:
+    local.protected("lidar", SLEEPER, ON_COMMAND)
+    take_checkpoint(local.client, "lidar")
+
+    async def steps(app: Top, pilot: Pilot[None]) -> None:
+        log = app.query_one("#events", RichLog)
+
+        def fits() -> bool:
+            lines = [line.text.rstrip() for line in log.lines]
+            return "registered" in "".join(lines) and max(map(len, lines)) <= log.scrollable_content_region.width
+
+        await until(pilot, lambda: "registered" in events(app), "the first event")
+        await asyncio.to_thread(local.client.command, "lidar", Command.RESTORE)
+        await until(pilot, lambda: "rolled back on command" in events(app), "a long one")
+        for columns in (40, 25, 100):
+            await pilot.resize_terminal(columns, 20)
+            await until(pilot, fits, f"all of it in {columns} columns")
+            await pilot.press("r")
+            await until(pilot, lambda: isinstance(app.screen, Ask), "a question")
+            await until(pilot, lambda: app.screen.query_one(Label).size.width > 0, "it is laid out")
+            assert app.screen.query_one(Label).region.right <= columns
+            await pilot.press("n")
+
+    driven(local, steps)
+
+
+@dataclass
+class Shown:
+    """`avckpt top` on a terminal, and what it has drawn there."""
+
+    process: subprocess.Popen[bytes]
+    leader: int
+    screen: bytes = b""
+
+    def sees(self, text: bytes) -> bool:
+        while select.select([self.leader], [], [], 0)[0]:
+            self.screen += os.read(self.leader, 65536)
+        return text in self.screen
+
+    def press(self, key: bytes) -> None:
+        os.write(self.leader, key)
+
+    def ends(self) -> int:
+        wait_until(
+            lambda: self.sees(b"\x1b[?1049l") and self.process.poll() is not None,
+            PATIENCE_S,
+            "the terminal is as before",
+        )
+        return int(self.process.returncode)
+
+
+@pytest.fixture
+def shown(local: LocalSidecar) -> Iterator[Shown]:
     local.protected("lidar", SLEEPER, LABELS)
     leader, terminal = pty.openpty()
     env = {**os.environ, **local.env, "TERM": "xterm-256color"}
-    shown = subprocess.Popen([*avckpt_command(), "top"], stdin=terminal, stdout=terminal, stderr=terminal, env=env)
-    screen = b""
-
-    def sees(text: bytes) -> bool:
-        nonlocal screen
-        while select.select([leader], [], [], 0)[0]:
-            screen += os.read(leader, 65536)
-        return text in screen
-
+    process = subprocess.Popen([*avckpt_command(), "top"], stdin=terminal, stdout=terminal, stderr=terminal, env=env)
     try:
-        wait_until(lambda: sees(b"lidar"), PATIENCE_S, "the unit")
-        os.write(leader, b"q")
-        wait_until(lambda: sees(b"\x1b[?1049l") and shown.poll() is not None, PATIENCE_S, "the terminal is as before")
-        assert shown.returncode == 0
+        shown = Shown(process, leader)
+        wait_until(lambda: shown.sees(b"lidar"), PATIENCE_S, "the unit")
+        yield shown
     finally:
-        shown.kill()
-        shown.wait()
+        process.kill()
+        process.wait()
+        os.close(terminal)
+        os.close(leader)
+
+
+@pytest.mark.shared_machine("a screen is given a time to show what it should")
+@pytest.mark.parametrize("keys", [b"q", b"\x03", b"r\x03"], ids=["q", "ctrl-c", "ctrl-c, when asked"])
+def test_on_a_terminal(shown: Shown, keys: bytes) -> None:
+    if keys.startswith(b"r"):
+        shown.press(b"r")
+        wait_until(lambda: shown.sees(b"Roll"), PATIENCE_S, "the question")
+    shown.press(keys[-1:])
+    assert shown.ends() == 0
+
+
+@pytest.mark.shared_machine("a screen is given a time to show what it should")
+def test_what_ends_it_leaves_the_terminal_as_it_was(shown: Shown) -> None:
+    shown.process.send_signal(signal.SIGTERM)
+    assert shown.ends() == 128 + signal.SIGTERM
+
+
+@pytest.mark.shared_machine("a screen is given a time to show what it should")
+def test_ctrl_z_stops_it(shown: Shown) -> None:
+    def state() -> str:
+        return Path(f"/proc/{shown.process.pid}/stat").read_text().rpartition(") ")[2][0]
+
+    shown.press(b"\x1a")
+    wait_until(lambda: shown.sees(b"\x1b[?1049l") and state() == "T", PATIENCE_S, "it is stopped")
+    shown.screen = b""
+    shown.process.send_signal(signal.SIGCONT)
+    wait_until(lambda: shown.sees(b"lidar"), PATIENCE_S, "it is back")
+    shown.press(b"q")
+    assert shown.ends() == 0
+
+
+def test_a_terminal_that_cannot_show_it(local: LocalSidecar) -> None:
+    leader, terminal = pty.openpty()
+    top, env = [*avckpt_command(), "top"], {**os.environ, **local.env, "TERM": "xterm-256color"}
+    no = subprocess.DEVNULL
+    try:
+        for stdin, stdout, stderr, name in (
+            (terminal, terminal, terminal, "dumb"),
+            (terminal, terminal, terminal, ""),
+            (no, terminal, terminal, "xterm"),
+            (terminal, terminal, no, "xterm"),
+        ):
+            said = subprocess.run(
+                top, stdin=stdin, stdout=stdout, stderr=stderr, env={**env, "TERM": name}, timeout=PATIENCE_S
+            )
+            assert said.returncode == 2
+        assert b"\x1b" not in os.read(leader, 65536)
+    finally:
         os.close(terminal)
         os.close(leader)
 

@@ -134,14 +134,34 @@ def test_a_sidecar_that_dies_meanwhile_is_told_in_words(run_dir: Path) -> None:
     assert "the sidecar went away (" in result.stderr
 
 
-def test_a_reader_that_has_enough_ends_it_as_any_other_program() -> None:
+def without_a_reader(command: str) -> tuple[int, str]:
+    """The status, and what it says, of a command whose output nobody reads any more."""
     reader, writer = os.pipe()
     os.close(reader)
     with os.fdopen(writer, "wb") as pipe:
-        done = subprocess.run(
-            [sys.executable, "-m", "avckpt", "completion", "bash"], stdout=pipe, stderr=subprocess.PIPE, text=True
-        )
-    assert (done.returncode, done.stderr) == (-signal.SIGPIPE, "")
+        argv = [sys.executable, "-m", "avckpt", *command.split()]
+        done = subprocess.run(argv, stdout=pipe, stderr=subprocess.PIPE, text=True, timeout=60)
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize("command", ["completion bash", "--help", "--version", "ps --help"])
+def test_a_reader_that_has_enough_ends_it_as_any_other_program(command: str) -> None:
+    assert without_a_reader(command) == (-signal.SIGPIPE, "")
+
+
+def test_a_reader_that_has_enough_ends_a_table_too(run_dir: Path) -> None:
+    body = json.dumps({"containers": [row()]})
+    answer = f"HTTP/1.0 200 OK\r\nContent-Length: {len(body)}\r\n\r\n{body}".encode()
+    with in_its_place(f"c,_=s.accept(); c.recv(9999); c.sendall({answer!r}); c.close()", run_dir):
+        assert without_a_reader("ps") == (-signal.SIGPIPE, "")
+
+
+@pytest.mark.parametrize(
+    ("command", "status"), [("ps", 3), ("nothing", 2), ("ps --nothing", 2), ("run -l a=b -- true", 2)]
+)
+def test_a_message_that_cannot_be_written_leaves_the_status_alone(command: str, status: int) -> None:
+    for redirection in ("2>/dev/full", "2>&-"):
+        assert os.waitstatus_to_exitcode(os.system(f"{sys.executable} -m avckpt {command} {redirection}")) == status
 
 
 def test_ctrl_c_ends_it_as_any_other_program(run_dir: Path) -> None:

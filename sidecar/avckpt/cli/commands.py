@@ -8,14 +8,15 @@ should start at once.
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import signal
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 from avckpt_hooks.shared.tell import printable
@@ -29,6 +30,8 @@ from avckpt.cli.web import web
 from avckpt.errors import AvckptError, ExitCode
 
 if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
+
     from avckpt.cli.client import Client, Json
 
 EPILOG = """
@@ -51,6 +54,8 @@ class Cli(click.Group):
         """Runs the command line."""
         if sys.stdout is None:  # the caller has closed it
             sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+        if sys.__stderr__ is not None and sys.stderr is sys.__stderr__:
+            sys.stderr = _unfailing(sys.__stderr__)
         try:
             return super().main(*args, **more)
         except OSError as error:
@@ -60,18 +65,46 @@ class Cli(click.Group):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             sys.exit(int(ExitCode.FAILED))
 
+    def make_context(self, *args: Any, **more: Any) -> click.Context:
+        """Reads the arguments, and carries out --help and --version."""
+        with _reported():
+            return super().make_context(*args, **more)
+
     def invoke(self, ctx: click.Context) -> Any:
         """Runs the command."""
-        try:
+        with _reported():
             return super().invoke(ctx)
-        except AvckptError as error:
-            click.echo(f"avckpt: {error}", err=True)
-            sys.exit(int(error.exit_code))
-        except KeyboardInterrupt:
-            click.echo("avckpt: interrupted", err=True)
-            _end_by(signal.SIGINT)
-        except BrokenPipeError:  # a reader such as head(1) has enough
-            _end_by(signal.SIGPIPE)
+
+
+@contextlib.contextmanager
+def _reported() -> Iterator[None]:
+    try:
+        yield
+    except AvckptError as error:
+        click.echo(f"avckpt: {error}", err=True)
+        sys.exit(int(error.exit_code))
+    except KeyboardInterrupt:
+        click.echo("avckpt: interrupted", err=True)
+        _end_by(signal.SIGINT)
+    except BrokenPipeError:  # a reader such as head(1) has enough
+        _end_by(signal.SIGPIPE)
+
+
+class _Unfailing(io.FileIO):
+    """A file that takes all that is written, also what is lost."""
+
+    def write(self, data: ReadableBuffer) -> int:
+        """Writes what can be."""
+        try:
+            return super().write(data) or len(bytes(data))
+        except OSError:
+            return len(bytes(data))
+
+
+def _unfailing(stderr: TextIO) -> TextIO:
+    """The same, where a message that cannot be written (a full disk) stops nothing, and leaves the status alone."""
+    raw = _Unfailing(stderr.fileno(), "w", closefd=False)
+    return io.TextIOWrapper(io.BufferedWriter(raw), stderr.encoding, stderr.errors, line_buffering=True)
 
 
 def _end_by(signum: signal.Signals) -> None:
@@ -255,9 +288,12 @@ def top() -> None:
 
     client = _client()
     client.info()
-    if not sys.stdout.isatty():
+    # The screen is drawn on standard error, and a terminal without a name is as good as none.
+    if not all(map(os.isatty, range(3))) or os.environ.get("TERM", "") in ("", "dumb"):
         raise click.UsageError("it needs a terminal; avckpt ps and avckpt events write to a pipe")
-    Top(client).run()
+    app = Top(client)
+    app.run()
+    sys.exit(app.return_code)
 
 
 @main.command()
@@ -429,7 +465,10 @@ def _print_table(containers: list[Json]) -> None:
     # Into a pipe nothing is wrapped: a line is a container.  On a terminal only the
     # note is; where even the rest is too wide, the terminal wraps it and nothing is lost.
     width = max(Console().width, sum(widths[:-1]) + 2 * len(widths) + NOTE_LEAST) if sys.stdout.isatty() else 1000
-    Console(width=width, highlight=False, markup=False).print(table)
+    console = Console(width=width, highlight=False, markup=False)
+    with console.capture() as printed:  # it would end with a status of its own when it cannot write
+        console.print(table)
+    click.echo(printed.get(), nl=False)
 
 
 COLUMNS = ("NAME", "STATE", "GENS", "MEMORY", "INTERVAL", "CHECKPOINT", "FREEZE", "RESTORES", "RESTORE", "NOTE")

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import signal
 import threading
 import time
 from collections import deque
@@ -27,6 +29,7 @@ from avckpt.errors import AvckptError
 from avckpt.guard import Command
 
 if TYPE_CHECKING:
+    from textual.events import Resize
     from textual.notifications import SeverityLevel
 
     from avckpt.cli.client import Client, Json
@@ -45,7 +48,7 @@ r       roll the chosen unit back to its newest checkpoint (asks first)
 e       events of the chosen unit only, or of all
 s       sort by name, or those that crashed last first
 ?       this help
-q       leave
+q       leave, as does Ctrl-C; Ctrl-Z stops it
 
 FREEZES and RESTORE have the last twelve, each against the longest of them.
 Any key closes this."""
@@ -81,7 +84,10 @@ def sparkline(values: Iterable[float]) -> str:
 class Ask(ModalScreen[bool]):
     """A question that y answers; any other key is no."""
 
-    DEFAULT_CSS = "Ask { align: center middle; } Ask Label { background: $panel; padding: 1 3; border: round $accent; }"
+    DEFAULT_CSS = (
+        "Ask { align: center middle; } "
+        "Ask Label { background: $panel; padding: 0 1; border: round $accent; max-width: 100%; }"
+    )
 
     def __init__(self, question: str) -> None:
         super().__init__()
@@ -96,6 +102,21 @@ class Ask(ModalScreen[bool]):
         self.dismiss(getattr(event, "key", "") == "y")
 
 
+class EventLog(RichLog):
+    """Lines of events, each wrapped where the screen ends."""
+
+    # The bar has its place before there is anything to scroll, or the first lines would be too long by it.
+    DEFAULT_CSS = "EventLog { scrollbar-gutter: stable; }"
+
+    def __init__(self, write_all: Callable[[], None]) -> None:
+        super().__init__(id="events", max_lines=LINES, min_width=0, wrap=True)
+        self._write_all = write_all
+
+    def on_resize(self, event: Resize) -> None:
+        """Wraps them anew; Textual calls the handler of the class above by itself."""
+        self._write_all()
+
+
 class Top(App[None]):
     """The screen.  Asks the sidecar in threads of its own, so that keys never wait for it."""
 
@@ -108,6 +129,9 @@ class Top(App[None]):
         Binding("s", "sort", "Sort"),
         Binding("question_mark", "help", "Help"),
         Binding("q", "quit", "Leave"),
+        # As in any other program, also while a question is asked; Textual itself only says how to leave.
+        Binding("ctrl+c", "quit", show=False, priority=True),
+        Binding("ctrl+z", "suspend_process", show=False, priority=True),
     ]
 
     def __init__(self, client: Client) -> None:
@@ -127,7 +151,7 @@ class Top(App[None]):
         with Vertical():
             table: DataTable[Text] = DataTable(id="units", cursor_type="row", zebra_stripes=True)
             yield table
-            yield RichLog(id="events", max_lines=LINES, wrap=True)
+            yield EventLog(self._write_events)
         yield Footer()
 
     def on_mount(self) -> None:
@@ -135,6 +159,8 @@ class Top(App[None]):
         for name in COLUMNS:
             self._table.add_column(name, key=name)
         self._table.focus()
+        # The terminal is to be as it was before.
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self.exit, None, 128 + signal.SIGTERM)
         # A thread that nobody waits for: it may be in a read when somebody leaves.
         threading.Thread(target=self._follow, daemon=True).start()
         self._look()
@@ -169,8 +195,7 @@ class Top(App[None]):
         self._seen.setdefault(event["id"], Seen()).take(event)
         if event["kind"] != "checkpoint":
             self._told.append(event)
-            if self._only in ("", event["id"]) or not event["id"]:
-                self._event_log.write(_line(event), expand=True)
+            self._write_event(event)
 
     # What is shown
 
@@ -179,8 +204,17 @@ class Top(App[None]):
         return self.query_one("#units", DataTable)
 
     @property
-    def _event_log(self) -> RichLog:
-        return self.query_one("#events", RichLog)
+    def _event_log(self) -> EventLog:
+        return self.query_one("#events", EventLog)
+
+    def _write_event(self, event: Json) -> None:
+        if self._only in ("", event["id"]) or not event["id"]:
+            self._event_log.write(_line(event), expand=True)
+
+    def _write_events(self) -> None:
+        self._event_log.clear()
+        for event in self._told:
+            self._write_event(event)
 
     def _show(self, rows: list[Json], problem: str) -> None:
         self._rows, self._problem = rows, problem
@@ -265,10 +299,7 @@ class Top(App[None]):
     def action_events(self) -> None:
         """Shows the events of one unit, or of all."""
         self._only = "" if self._only else self._chosen()
-        self._event_log.clear()
-        for event in self._told:
-            if self._only in ("", event["id"]) or not event["id"]:
-                self._event_log.write(_line(event), expand=True)
+        self._write_events()
 
     def action_sort(self) -> None:
         """Sorts the other way."""
