@@ -14,10 +14,12 @@ import socket
 import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
+from email.message import Message
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
+from avckpt.cli.client import _UnixConnection
 from selenium import webdriver
 from selenium.webdriver.chrome.options import Options
 from selenium.webdriver.chrome.service import Service
@@ -194,6 +196,31 @@ def test_strangers_get_nothing(local: LocalSidecar) -> None:
         )
     with site(local, "--control", "--name", "vehicle.example") as page:
         assert page.ask("/v1/containers/x/restore", "POST", Host="vehicle.example")[0] == 404  # no such container
+
+
+def test_it_answers_as_http_has_it(local: LocalSidecar) -> None:
+    def headers(connection: http.client.HTTPConnection, method: str, path: str, token: str) -> tuple[int, Message]:
+        with contextlib.closing(connection):
+            connection.request(method, path, headers={"Authorization": f"Bearer {token}"})
+            answer = connection.getresponse()
+            return answer.status, answer.headers
+
+    def api() -> http.client.HTTPConnection:
+        return _UnixConnection(local.run_dir / "api.sock", PATIENCE_S)
+
+    with site(local) as page:
+
+        def web() -> http.client.HTTPConnection:
+            return http.client.HTTPConnection("127.0.0.1", page.port, timeout=PATIENCE_S)
+
+        metrics = headers(api(), "GET", "/metrics", "")[1]["Content-Type"]
+        assert "version=" in metrics
+        assert headers(web(), "GET", "/metrics", page.token)[1]["Content-Type"] == metrics
+        assert headers(web(), "GET", "/metrics", "wrong")[1]["WWW-Authenticate"] == "Bearer"
+        for connect in (api, web):
+            for method, path, allowed in (("DELETE", "/v1/info", "GET,HEAD"), ("HEAD", "/v1/events", "GET")):
+                status, said = headers(connect(), method, path, page.token)
+                assert (status, said["Allow"]) == (405, allowed)
 
 
 def test_strangers_keep_nobody_out_and_fill_no_log(local: LocalSidecar) -> None:

@@ -108,7 +108,7 @@ class ApiServer:
                 web.get("/v1/containers/{name}", self._inspect),
                 web.post("/v1/containers/{name}/{command:checkpoint|restore}", self._command),
                 web.post("/v1/reload", self._reload),
-                web.get("/v1/events", self._events),
+                web.get("/v1/events", self._events, allow_head=False),  # it would wait for a body that is none
                 web.get("/v1/history", self._history),
                 web.get("/v1/openapi.json", self._openapi),
                 web.get("/metrics", self._metrics),
@@ -275,7 +275,10 @@ async def _errors_as_json(
     except AvckptError as error:
         return web.json_response({"error": error.to_json()}, status=STATUS.get(type(error), 500))
     except web.HTTPException as error:
-        return _request_error(f"{request.method} {request.path}: {error.reason}", error.status)
+        refused = _request_error(f"{request.method} {request.path}: {error.reason}", error.status)
+        if "Allow" in error.headers:
+            refused.headers["Allow"] = error.headers["Allow"]
+        return refused
     except Exception:
         log.exception("%s %s", request.method, request.path)
         return _request_error(f"{request.method} {request.path}: a bug of the sidecar's, see its log", 500)

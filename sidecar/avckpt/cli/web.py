@@ -32,8 +32,8 @@ def web(listen: str, port: int, names: tuple[str, ...], token_file: Path | None,
     It prints the page's URL, with a token; anyone who has the URL may read.  It is read-only
     unless started with --control, needs no other host, and ends on Ctrl-C.
 
-    A dashboard, or Prometheus, may read /metrics and the paths below /v1/ with the
-    header "Authorization: Bearer TOKEN".
+    A dashboard, or Prometheus, may read /metrics and, of the API, /v1/info, /v1/containers,
+    /v1/events and /v1/history, with the header "Authorization: Bearer TOKEN".
     """
     import asyncio
     import contextlib

@@ -87,7 +87,7 @@ class WebServer:
         app.router.add_get("/", self._page)
         app.router.add_get("/{name:[a-z_]+\\.(?:css|js)}", self._page)
         for path in PASSED:
-            app.router.add_get(path, self._pass_on)
+            app.router.add_get(path, self._pass_on, allow_head=path != "/v1/events")
         app.router.add_get("/v1/access", self._tell_access)
         app.router.add_post("/v1/containers/{name}/{command:checkpoint|restore}", self._command)
         app.cleanup_ctx.append(self._connect)
@@ -105,7 +105,7 @@ class WebServer:
             self._check(request)
             response = await handler(request)
         except web.HTTPException as error:
-            response = _refusal(error.status, error.reason)
+            response = _refusal(error)
         if not response.prepared:
             response.headers.update(HEADERS)
         return response
@@ -122,7 +122,9 @@ class WebServer:
             if not hmac.compare_digest(
                 given.encode("utf-8", "surrogateescape"), f"Bearer {self._access.token}".encode()
             ):
-                raise web.HTTPUnauthorized(reason="the token is missing or wrong")
+                raise web.HTTPUnauthorized(
+                    reason="the token is missing or wrong", headers={"WWW-Authenticate": "Bearer"}
+                )
 
     async def _page(self, request: web.Request) -> web.Response:
         name = request.match_info.get("name", "index.html")
@@ -149,7 +151,7 @@ class WebServer:
                 request.method, f"http://sidecar{request.rel_url.raw_path_qs}", headers=headers
             ) as answer:
                 response = web.StreamResponse(status=answer.status, headers=HEADERS)
-                response.content_type = answer.content_type
+                response.headers["Content-Type"] = answer.headers["Content-Type"]  # with its version and charset
                 await response.prepare(request)
                 async for chunk in answer.content.iter_any():
                     await response.write(chunk)
@@ -175,8 +177,9 @@ def _is_address(name: str) -> bool:
     return True
 
 
-def _refusal(status: int, reason: str) -> web.Response:
-    return web.json_response({"error": {"kind": "web", "message": reason}}, status=status)
+def _refusal(error: web.HTTPException) -> web.Response:
+    headers = {name: error.headers[name] for name in ("Allow", "WWW-Authenticate") if name in error.headers}
+    return web.json_response({"error": {"kind": "web", "message": error.reason}}, status=error.status, headers=headers)
 
 
 async def start(run_dir: Path, listen: str, port: int, access: Access) -> web.AppRunner:
