@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from testkit.bundles import read_bundle
-from testkit.harness import ContainerFactory, Sidecar, wait_until
+from testkit.harness import ContainerFactory, Sidecar, avckpt_command, run, wait_until
+from testkit.local_sidecar import ON_COMMAND, LocalSidecar
 from testkit.protected import told
 
 SECRET = "a-secret-of-the-application"
@@ -83,3 +84,15 @@ def test_all_that_is_known_of_a_container(sidecar: Sidecar, container: Container
         4,
         True,
     )
+
+
+def test_half_an_archive_does_not_stay(local: LocalSidecar, tmp_path: Path) -> None:
+    local.protected("lidar", ["sleep", "1000"], ON_COMMAND)
+    bundle = [*avckpt_command(), "bundle", "lidar", "-o", str(tmp_path / "lidar.tar.gz")]
+    limit = ["prlimit", "--fsize=1000"]  # as if that were all that the disk holds
+    said = run([*limit, *bundle], env=local.env, check=False, timeout_s=60)
+    assert (said.status, "lidar.tar.gz cannot be written (File too large)" in said.stderr) == (1, True)
+    assert list(tmp_path.glob("lidar.tar.gz")) == []
+    (tmp_path / "lidar.tar.gz").write_text("another's")
+    assert run(bundle, env=local.env, check=False, timeout_s=60).status == 1
+    assert (tmp_path / "lidar.tar.gz").read_text() == "another's"

@@ -94,8 +94,13 @@ def bundle(name: str, output: Path | None, core: bool) -> None:
     path = output or Path(f"{stem}.tar.gz")
     try:
         # Only its owner may read it: a log may say more than others should know.
-        with open(path, "xb", opener=_open_private) as file:
-            missing = write(file, stem, list(contents(client, container, events, event=event, core=core)))
+        file = open(path, "xb", opener=_open_private)  # noqa: SIM115 - if it cannot be made, it is not ours to remove
+        try:
+            with file:
+                missing = write(file, stem, list(contents(client, container, events, event=event, core=core)))
+        except BaseException:
+            path.unlink(missing_ok=True)  # half an archive is none, and the next one could not have its name
+            raise
     except OSError as error:
         raise AvckptError(f"{path} cannot be written", errno=error.errno or 0) from error
     for each in missing:
