@@ -224,6 +224,7 @@ class Phoenix(Init):
         options: Sequence[str] = (),
         prefix: Sequence[str] = (),
         stdin: int | None = subprocess.DEVNULL,
+        stderr: int | None = subprocess.PIPE,
         preexec: Callable[[], None] | None = None,
     ) -> None:
         template, template_far = socket.socketpair()
@@ -237,6 +238,7 @@ class Phoenix(Init):
             pass_fds=far,
             prefix=prefix,
             stdin=stdin,
+            stderr=stderr,
             preexec=preexec,
         )
         template_far.close()

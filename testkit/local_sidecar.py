@@ -94,11 +94,14 @@ class LocalSidecar:
         path = self.run_dir.with_suffix(".log")
         return path.read_text() if path.exists() else ""
 
-    def start(self) -> None:
+    def start(self, *options: str, stderr: int | None = None) -> None:
         """Starts it and waits until it answers."""
         with self.run_dir.with_suffix(".log").open("ab") as log:
             self.process = subprocess.Popen(
-                [*self.command, "sidecar"], stderr=log, env={**os.environ, **self.env}, stdin=subprocess.DEVNULL
+                [*self.command, "sidecar", *options],
+                stderr=log if stderr is None else stderr,
+                env={**os.environ, **self.env},
+                stdin=subprocess.DEVNULL,
             )
         wait_until(self._answers, 60, "the sidecar answers")
 

@@ -47,6 +47,7 @@
 #define NAME "avckpt-init"
 #define EXIT_USAGE 125 /* init's own failure, as for Podman */
 #define END_CHILDREN_MS 500
+#define READER_MS 200 /* whoever reads our messages does so within this time */
 #define KEYS_MS 10000 /* an exit within this time after Ctrl-C was requested */
 #define VERDICTS_PER_ROUND 1024
 
@@ -103,9 +104,11 @@ uint64_t now_ns(void)
 	return (uint64_t)ts.tv_sec * 1000 * NS_PER_MS + (uint64_t)ts.tv_nsec;
 }
 
-/* One line on stderr, in one write so that it is not torn. */
+/* One line on stderr, in one write so that it is not torn. Where nobody reads it is left out: the app
+ * must not fail to start, get a signal or end because of it. */
 void say(const char *format, ...)
 {
+	struct pollfd out = { .fd = STDERR_FILENO, .events = POLLOUT };
 	char line[PIPE_BUF] = NAME ": ";
 	size_t len = strlen(line);
 	va_list args;
@@ -118,8 +121,8 @@ void say(const char *format, ...)
 		return;
 	len += (size_t)n < sizeof(line) - len - 1 ? (size_t)n : sizeof(line) - len - 2;
 	line[len++] = '\n';
-	/* Nowhere to report a failure. */
-	if (write(STDERR_FILENO, line, len) < 0)
+	/* A pipe that has room has room for PIPE_BUF. Nowhere to report a failure. */
+	if (poll(&out, 1, READER_MS) != 1 || write(STDERR_FILENO, line, len) < 0)
 		return;
 }
 

@@ -22,6 +22,7 @@ import pytest
 
 from testkit.harness import Completed, avckpt_command, run, wait_until
 from testkit.local_sidecar import app_of
+from testkit.pipes import full_pipe
 from testkit.procfs import children_of, comm_of, status_of
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="avckpt run needs root")
@@ -220,6 +221,21 @@ def test_a_signal_that_comes_very_early_is_not_lost(start) -> None:  # type: ign
         assert running.init
         running.process.terminate()
         assert running.process.wait(10) == 128 + signal.SIGTERM
+
+
+@SHARED
+def test_messages_that_nobody_reads_hold_nothing_up() -> None:
+    program = ("sh", "-c", "trap 'exit 5' TERM; echo ready; while :; do sleep 0.05; done")
+    with full_pipe() as (_, writer):
+        argv = [*avckpt_command(), "run", "-v", "--label", "avckpt.interval=50ms", "--", *program]
+        with subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=writer) as process:
+            try:
+                assert process.stdout is not None
+                assert process.stdout.readline() == b"ready\n"
+                process.terminate()
+                assert process.wait(20) == 5
+            finally:
+                process.kill()
 
 
 @SHARED

@@ -23,6 +23,7 @@ from pathlib import Path
 
 import pytest
 from avckpt.cli.client import COMMAND_S, Client
+from avckpt.errors import SidecarUnreachable
 from avckpt_hooks import precreate
 from avckpt_hooks.shared import protocol
 
@@ -30,6 +31,7 @@ from testkit.cgroups import freezer
 from testkit.family import look
 from testkit.harness import ROOT, avckpt_command, run, take_checkpoint, wait_until
 from testkit.local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, ended, local_sidecar
+from testkit.pipes import emptied, full_pipe
 from testkit.procfs import children_of
 
 SLEEPER = ["sleep", "1000"]
@@ -574,6 +576,29 @@ def stopped_thread(tid: int) -> Iterator[None]:
         yield
     finally:
         assert libc.ptrace(detach, *arguments) == 0
+
+
+@SHARED
+def test_a_log_that_nobody_reads_holds_nothing_up(idle_sidecar: LocalSidecar) -> None:
+    with full_pipe() as (reader, writer):
+        idle_sidecar.start("--watchdog", stderr=writer)
+        web = idle_sidecar.protected("web", SLEEPER)
+        idle_sidecar.wait_for(web, state="protected")
+        first = idle_sidecar.client.info()["pid"]
+        os.kill(first, signal.SIGKILL)
+
+        def another() -> bool:
+            with contextlib.suppress(SidecarUnreachable):
+                return bool(idle_sidecar.client.info()["pid"] != first)
+            return False
+
+        wait_until(another, 30, "the watchdog has started another daemon")
+        idle_sidecar.wait_for(web, state="protected", restores=0)
+        assert set(emptied(reader)) == {"."}
+        os.kill(web.app_pid, signal.SIGKILL)
+        idle_sidecar.wait_for(web, restores=1)
+        log = wait_until(lambda: emptied(reader), 10, "it writes again")
+        assert re.match(r"avckpt: \d+ message\(s\) left out here: nobody read them\n2\d\d\d-.* web: ", log)
 
 
 def test_a_second_sidecar_refuses_and_the_first_goes_on(local: LocalSidecar) -> None:

@@ -22,6 +22,7 @@ import pytest
 
 from testkit.harness import wait_until
 from testkit.init_peer import INIT, PATIENCE_S, Guard, Init, Phoenix
+from testkit.pipes import full_pipe
 from testkit.procfs import children_of, state_of
 
 pytestmark = pytest.mark.usefixtures("init_built", "victims_built")
@@ -76,6 +77,11 @@ def test_program_not_found() -> None:
     with Init(["no-such-program"]) as init:
         assert init.end() == 127
         assert init.error_text() == "avckpt-init: no-such-program: No such file or directory\n"
+
+
+def test_nobody_waits_for_a_reader_of_its_messages() -> None:
+    with full_pipe() as (_, writer), Init(["no-such-program"], stderr=writer) as init:
+        assert init.end() == 127
 
 
 @pytest.mark.parametrize("program", ["/etc/passwd", "/etc"])

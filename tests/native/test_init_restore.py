@@ -17,6 +17,7 @@ import pytest
 
 from testkit.harness import wait_until
 from testkit.init_peer import CTL, PATIENCE_S, Guard, Init, Page, Phoenix, Verdict
+from testkit.pipes import full_pipe
 from testkit.procfs import children_of, comm_of, state_of
 
 pytestmark = pytest.mark.usefixtures("init_built", "victims_built")
@@ -241,6 +242,14 @@ def test_give_up(pid1: bool) -> None:
         guard.answer(1, Verdict.GIVE_UP)
         assert init.end() == 9
         assert "phoenix ended with status 9 and was not restored: the guard gave up\n" in init.error_text()
+
+
+@both
+def test_an_end_waits_for_no_reader_of_its_messages(pid1: bool) -> None:
+    with full_pipe() as (_, writer), Phoenix(pid1=pid1, options=LONG_WAIT, stderr=writer) as init, Guard(init) as guard:
+        init.app.say("die 11")
+        guard.answer(guard.report().seq, Verdict.GIVE_UP)
+        assert init.end() == 128 + signal.SIGSEGV
 
 
 @both

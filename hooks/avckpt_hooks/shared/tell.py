@@ -12,7 +12,8 @@ from __future__ import annotations
 import os
 import stat
 
-_WAIT_MS = 200
+WAIT_MS = 200
+"""Whoever reads does so within this time."""
 _LINE_MAX = 2000  # well below PIPE_BUF: a line is written whole or not at all
 _DAEMON_WARNING = 3 << 3 | 4  # LOG_DAEMON | LOG_WARNING, see syslog(3)
 _SYS_PIDFD_GETFD = 438  # the same on every architecture
@@ -21,7 +22,7 @@ _SYS_PIDFD_GETFD = 438  # the same on every architecture
 def parent(line: str, pid: int | None = None) -> bool:
     """Writes one line, made printable, to the standard error of the parent (or `pid`).
 
-    True if a user can read it there. Never raises, never waits longer than _WAIT_MS
+    True if a user can read it there. Never raises, never waits longer than WAIT_MS
     for a reader.
     """
     try:
@@ -59,6 +60,15 @@ def printable(line: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
 
 
+def has_room(fd: int, wait_ms: int) -> bool:
+    """Whether a write(2) of PIPE_BUF bytes would not wait, or fail at once; waits that long for a reader."""
+    import select
+
+    poll = select.poll()
+    poll.register(fd, select.POLLOUT)
+    return bool(poll.poll(wait_ms))
+
+
 def _stderr_of(pid: int) -> int:
     """A descriptor for `pid`'s standard error.  Raises OSError."""
     # The descriptor itself, by pidfd_getfd(2), instead of reopening the file: with `2>file` a second open
@@ -86,16 +96,12 @@ def _borrow(pid: int, number: int) -> int:
 
 
 def _write(fd: int, line: str) -> bool:
-    import select
-
     status = os.fstat(fd)
     if stat.S_ISCHR(status.st_mode) and status.st_rdev == os.makedev(1, 3):  # /dev/null
         return False
     # A raw terminal (as set by podman run -t) does not return to column 1 by itself.
     end = "\r\n" if os.isatty(fd) else "\n"
-    poll = select.poll()
-    poll.register(fd, select.POLLOUT)
-    if not stat.S_ISREG(status.st_mode) and not poll.poll(_WAIT_MS):
+    if not has_room(fd, WAIT_MS):
         return False
     packet = (printable(line)[:_LINE_MAX] + end).encode(errors="replace")
     return os.write(fd, packet) == len(packet)

@@ -224,10 +224,12 @@ def sidecar(verbose: bool, config: Path, watchdog: bool) -> None:
     starting = _say_that_it_starts()  # noqa: F841 - open, and locked, as long as this process lives
     import logging
 
+    from avckpt.messages import Messages
+
     logging.basicConfig(
         level=logging.DEBUG if verbose else logging.INFO,
         format="%(asctime)s %(levelname)s %(message)s",
-        stream=sys.stderr,
+        handlers=[logging.StreamHandler(Messages(2))],
     )
     logging.getLogger("asyncio").setLevel(logging.WARNING)
     if not watchdog:

@@ -37,6 +37,7 @@ from avckpt.events.journal import Journal
 from avckpt.events.record import of_guard
 from avckpt.events.vocabulary import Kind, signal_name
 from avckpt.guard import GuardConfig
+from avckpt.messages import Messages
 from avckpt.policy import Settings, settings_of
 
 NOT_FORWARDED = frozenset(
@@ -255,12 +256,12 @@ class Job:
             os.killpg(self._group, signal.SIGCONT)
 
 
+_messages = Messages(2)
+
+
 def say(text: str) -> None:
-    """Writes one message. A closed reader must not end the program."""
-    try:
-        os.write(2, f"avckpt: {text}\n".encode())
-    except OSError:
-        return
+    """Writes one message. A reader that is gone must not end the program, and one that hangs not hold it up."""
+    _messages.write(f"avckpt: {text}\n")
 
 
 @contextmanager
