@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import fcntl
 import os
 import resource
@@ -30,8 +31,9 @@ def only_one(run_dir: Path) -> Iterator[None]:
             raise Busy(
                 f"a sidecar is running already (pid {holder or 'unknown'}, {run_dir}): stop it first, or use that one"
             ) from error
-        os.ftruncate(fd, 0)
-        os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
+        with contextlib.suppress(OSError):  # a full disk: another one is not told whom it finds
+            os.ftruncate(fd, 0)
+            os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
         yield
     finally:
         os.close(fd)  # which unlocks; the file stays, or two sidecars could lock different files

@@ -601,6 +601,25 @@ def test_a_log_that_nobody_reads_holds_nothing_up(idle_sidecar: LocalSidecar) ->
         assert re.match(r"avckpt: \d+ message\(s\) left out here: nobody read them\n2\d\d\d-.* web: ", log)
 
 
+@SHARED
+def test_a_sidecar_starts_on_a_full_disk_and_protects(idle_sidecar: LocalSidecar) -> None:
+    folder = idle_sidecar.run_dir
+    folder.mkdir()
+    run(["mount", "-t", "tmpfs", "-o", "size=64k", "avckpt-test", str(folder)])
+    try:
+        with (folder / "others").open("wb", buffering=0) as file, contextlib.suppress(OSError):
+            while file.write(bytes(4096)):
+                pass
+        idle_sidecar.start()
+        web = idle_sidecar.container("web", SLEEPER)
+        assert "is not known to a sidecar that starts later" in web.hook("prestart", QUICK)
+        idle_sidecar.wait_for(web, state="protected")
+        os.kill(web.app_pid, signal.SIGKILL)
+        idle_sidecar.wait_for(web, restores=1)
+    finally:
+        run(["umount", "--lazy", str(folder)])
+
+
 def test_a_second_sidecar_refuses_and_the_first_goes_on(local: LocalSidecar) -> None:
     second = local.avckpt("sidecar", check=False)
     assert second.status == 1
