@@ -145,6 +145,18 @@ def test_no_descriptor_and_no_signal_setting_of_ours_leaks() -> None:
     assert avckpt_run("--", "sh", "-c", script).stdout == bare.stdout
 
 
+@pytest.mark.parametrize("closed", ["<&-", "2>&-", ">&- 2>&-", "<&- 2>&-", "<&- >&- 2>&-"])
+def test_standard_descriptors_that_are_closed_are_so_for_the_program(closed: str, tmp_path: Path) -> None:
+    def found(*wrapper: str) -> str:
+        script = f"sleep 0.3; ls /proc/$$/fd > {tmp_path}/found; exit 5"
+        done = run(["sh", "-c", f'"$@" {closed}', "sh", *wrapper, "sh", "-c", script], check=False, timeout_s=30)
+        assert done.status == 5
+        return (tmp_path / "found").read_text()
+
+    avckpt = (*avckpt_command(), "run", "-v", "--label", "avckpt.interval=50ms", "--")
+    assert found(*avckpt) == found()
+
+
 def test_nohup_is_passed_on() -> None:
     done = avckpt_run(
         "--", "grep", "^SigIgn", "/proc/self/status", wrapper=("sh", "-c", 'trap "" HUP INT; exec "$@"', "sh")

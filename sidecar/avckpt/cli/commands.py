@@ -52,6 +52,7 @@ class Cli(click.Group):
 
     def main(self, *args: Any, **more: Any) -> Any:
         """Runs the command line."""
+        _keep_standard_numbers()
         if sys.stdout is None:  # the caller has closed it
             sys.stdout = open(os.devnull, "w")  # noqa: SIM115
         if sys.__stderr__ is not None and sys.stderr is sys.__stderr__:
@@ -105,6 +106,17 @@ def _unfailing(stderr: TextIO) -> TextIO:
     """The same, where a message that cannot be written (a full disk) stops nothing, and leaves the status alone."""
     raw = _Unfailing(stderr.fileno(), "w", closefd=False)
     return io.TextIOWrapper(io.BufferedWriter(raw), stderr.encoding, stderr.errors, line_buffering=True)
+
+
+def _keep_standard_numbers() -> None:
+    """What we open gets no number of a standard descriptor that the caller has closed: messages would go there.
+
+    What we execute has it closed, as the caller wanted it.
+    """
+    with contextlib.suppress(OSError):
+        while (fd := os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)) <= 2:
+            pass
+        os.close(fd)
 
 
 def _end_by(signum: signal.Signals) -> None:
