@@ -384,7 +384,7 @@ def _is_starting() -> bool:
     from avckpt_hooks.shared import protocol
 
     try:
-        fd = os.open(protocol.starting_lock(), os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        fd = os.open(protocol.starting_lock(), os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW)
     except OSError:
         return False
     try:

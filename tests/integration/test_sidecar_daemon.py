@@ -620,6 +620,22 @@ def test_a_sidecar_starts_on_a_full_disk_and_protects(idle_sidecar: LocalSidecar
         run(["umount", "--lazy", str(folder)])
 
 
+@SHARED
+def test_fifos_in_place_of_its_small_files_hold_nobody_up(
+    idle_sidecar: LocalSidecar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = idle_sidecar.run_dir
+    folder.joinpath("containers").mkdir(parents=True)
+    for path in ("starting", "present.json", f"containers/{'d' * 64}.json"):
+        os.mkfifo(folder / path)
+    idle_sidecar.start()
+    web = idle_sidecar.protected("web", SLEEPER)
+    idle_sidecar.wait_for(web, state="protected")
+    assert idle_sidecar.stop() == 0
+    monkeypatch.setenv("AVCKPT_RUN_DIR", str(folder))
+    assert not precreate._is_starting()
+
+
 def test_a_second_sidecar_refuses_and_the_first_goes_on(local: LocalSidecar) -> None:
     second = local.avckpt("sidecar", check=False)
     assert second.status == 1

@@ -265,7 +265,8 @@ def _say_that_it_starts() -> int:
     from avckpt_hooks.shared import protocol
 
     try:
-        fd = os.open(protocol.starting_lock(), os.O_RDONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        flags = os.O_RDONLY | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW
+        fd = os.open(protocol.starting_lock(), flags, 0o600)
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError:
         return -1

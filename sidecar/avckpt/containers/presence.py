@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from avckpt_hooks.shared.files import read_bounded, write_at_once
+from avckpt_hooks.shared.files import read_own, write_at_once
 from avckpt_hooks.shared.tell import printable
 
 from avckpt.containers.protected import Protected
@@ -68,7 +68,7 @@ class Presence:
     def _outage(self, now: dict[str, int], is_recorded: Callable[[str], bool]) -> str:
         try:
             gone_s = max(time.time() - self._path.stat().st_mtime, 0)
-            before = json.loads(read_bounded(str(self._path), FILE_BYTES))
+            before = json.loads(read_own(str(self._path), FILE_BYTES))
             how = "was stopped" if before["stopped"] else "crashed or was killed"
             rows = {str(key): (str(name), int(pid)) for key, (name, pid) in before["containers"].items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:

@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from avckpt_hooks.shared.files import make_private, read_bounded
+from avckpt_hooks.shared.files import make_private, read_own
 from avckpt_hooks.shared.protocol import MAX_BYTES, Register
 
 from avckpt.containers.process import open_pidfd
@@ -96,7 +96,7 @@ def _open(path: Path) -> tuple[Register, int] | None:
 
     Raises OSError, and what _parse() does.
     """
-    text = read_bounded(str(path), RECORD_BYTES)
+    text = read_own(str(path), RECORD_BYTES)
     record = _parse(text)
     try:
         return record, open_pidfd(record.pid, record.starttime)

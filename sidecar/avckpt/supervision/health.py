@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from avckpt_hooks.shared.files import read_bounded
+from avckpt_hooks.shared.files import read_own
 from avckpt_hooks.shared.protocol import MAX_BYTES
 from avckpt_hooks.shared.tell import printable
 
@@ -159,7 +159,7 @@ async def _known(answer: Path, tell: Tell) -> HealthCheck | None:
     why = "the hooks did not find it out"
     while time.monotonic() < deadline:
         try:
-            said = json.loads(read_bounded(str(answer), MAX_BYTES))
+            said = json.loads(read_own(str(answer), MAX_BYTES))
             has_startup_check = bool(said.get("startup_healthcheck"))
             check = health_check_of(said.get("healthcheck"), has_startup_check=has_startup_check)
             if check is not None and check.interval_s:
