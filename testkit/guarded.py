@@ -289,6 +289,8 @@ class Victim(Init):
         super().__exit__(kind, error, trace)
         self._file.close()
         self.board.page.close()
+        if error is not None and (said := self.said):
+            error.add_note(f"{self.command} said: {said[-2000:]}")
 
     @property
     def said(self) -> str:

@@ -5,13 +5,17 @@ from __future__ import annotations
 
 import itertools
 import os
+import shutil
+import signal
+import subprocess
 import time
 from pathlib import Path
 
 import pytest
 
 from testkit.guarded import WHERE, GuardProcess, Victim, config
-from testkit.harness import SLOWNESS
+from testkit.harness import SLOWNESS, wait_until
+from testkit.procfs import status_of
 
 pytestmark = pytest.mark.shared_machine("timeouts of blocked calls are compared with the clock")
 
@@ -114,6 +118,21 @@ def test_a_timeout_survives_a_restore(under: str, tmp_path: Path) -> None:
         victim.check()
         later = victim.see().counter[KINDS_AT : KINDS_AT + KINDS]
         assert sum(after > before for before, after in zip(calls, later)) == TIMED, (calls, later)
+
+
+@pytest.mark.skipif(not shutil.which("strace"), reason="strace is what slows the guard down; it is not installed")
+def test_threads_wait_for_a_slow_guard_while_they_are_restored(tmp_path: Path) -> None:
+    """Each time it takes long, the kernel could make a thread that is not its own yet continue its wait."""
+    delay = f"inject=ptrace:delay_exit={2000 * SLOWNESS:.0f}"
+    with Victim("under killing threads 6 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        assert guard.checkpoint()["kind"] == "checkpoint"
+        command = ["strace", "-f", "-qq", "-o", "/dev/null", "-e", "trace=ptrace", "-e", delay, "-p", str(guard.pid)]
+        with subprocess.Popen(command) as strace:
+            wait_until(lambda: status_of(guard.pid)["TracerPid"] == str(strace.pid), 10 * SLOWNESS, "strace traces it")
+            victim.kill_app()
+            guard.wait("restored")
+            strace.send_signal(signal.SIGINT)
+        victim.wait_beats()
 
 
 @pytest.mark.parametrize("interval_s", [0.1, 1.0])

@@ -146,13 +146,11 @@ static void bring_home(pid_t tid)
 /* False: it has exited, or was killed. */
 static bool halt(struct sandbox *sandbox, pid_t tid)
 {
+	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
+		return false;
 	for (;;) {
-		struct stop stop;
+		const struct stop stop = tracee_wait(tid, 0);
 
-		/* Again after each stop, which clears it (tracee_await_while()). */
-		if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
-			return false;
-		stop = tracee_wait(tid, 0);
 		if (stop.kind == STOP_TRAP || stop.kind == STOP_GROUP) {
 			sandbox->in_stop = stop.kind == STOP_GROUP;
 			return true;
@@ -161,6 +159,10 @@ static bool halt(struct sandbox *sandbox, pid_t tid)
 			return false;
 		if (stop.kind == STOP_SYSCALL)
 			at_call(sandbox, tid, SANDBOX_OPTIONS);
+		/* Again after each stop, which clears it (tracee_await_while()), and before it goes
+		 * on: the kernel would make it continue its wait by restart_syscall(2). */
+		if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
+			return false;
 		ptrace(PTRACE_SYSCALL, tid, NULL, 0L);
 	}
 }

@@ -83,13 +83,15 @@ static bool is_among(const struct kinds *kinds, long nr, uint64_t arg)
 	return false;
 }
 
-/* Whether injected code makes such a call; `inside` is its process's own PID. */
+/* Whether injected code makes such a call, or the kernel for it, when somebody has interrupted its
+ * wait; `inside` is its process's own PID. */
 static bool is_wanted(const struct arch_regs *regs, pid_t inside)
 {
 	const long nr = arch_syscall_nr(regs);
 	const uint64_t arg = arch_syscall_arg(regs, 0);
 
-	if (!is_among(&seccomp_wanted, nr, arg) && !is_among(&seccomp_wanted_to_restore, nr, arg))
+	if (!is_among(&seccomp_wanted, nr, arg) && !is_among(&seccomp_wanted_to_restore, nr, arg) &&
+	    !is_among(&seccomp_restarts, nr, arg))
 		return false;
 	switch (nr) {
 	case SYS_ioctl:
