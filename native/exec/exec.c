@@ -104,11 +104,64 @@ static char **take(char **argv, const char *what)
 	return argv + 1;
 }
 
+/* NGROUPS GROUP...; returns what follows. */
+static char **read_groups(char **argv)
+{
+	long count = number(*argv++, "NGROUPS");
+
+	for (; count > 0; count--) {
+		char **next = take(argv, "GROUP");
+
+		errno = E2BIG;
+		must(job.group_count < GROUPS_MAX, "GROUP");
+		job.groups[job.group_count++] = (gid_t)number(*argv, "GROUP");
+		argv = next;
+	}
+	return argv;
+}
+
+/* NCGROUPS FILE...; returns what follows. */
+static char **read_cgroups(char **argv)
+{
+	char **next = take(argv, "NCGROUPS");
+	long count = number(*argv, "NCGROUPS");
+
+	for (argv = next; count > 0; count--) {
+		next = take(argv, "FILE");
+		errno = E2BIG;
+		must(job.cgroup_count < CGROUPS_MAX, "FILE");
+		job.cgroup_fds[job.cgroup_count] = open(*argv, O_WRONLY | O_CLOEXEC);
+		must(job.cgroup_fds[job.cgroup_count++] >= 0, *argv);
+		argv = next;
+	}
+	return argv;
+}
+
+/* The environment is for the command, not for us: it can hold variables that affect our own C
+ * library. */
+static void read_environment(int fd)
+{
+	struct stat st;
+	char *text;
+	size_t n = 0, i = 0;
+
+	must(fstat(fd, &st) == 0, "ENV_FD");
+	errno = E2BIG;
+	must(st.st_size <= ENVIRONMENT_MAX, "ENV_FD");
+	text = calloc(1, (size_t)st.st_size + 1);
+	must(text != NULL, "calloc");
+	must(pread(fd, text, (size_t)st.st_size, 0) == st.st_size, "ENV_FD");
+	for (off_t at = 0; at < st.st_size; at++)
+		n += text[at] == '\0';
+	job.env = calloc(n + 2, sizeof *job.env);
+	must(job.env != NULL, "calloc");
+	for (char *at = text; at < text + st.st_size && i <= n; at += strlen(at) + 1)
+		job.env[i++] = at;
+}
+
 static void read_arguments(char **argv)
 {
 	unsigned int nnp;
-	long count;
-	int fd;
 
 	for (int i = 0; i < 7; i++) {
 		errno = EINVAL;
@@ -118,57 +171,16 @@ static void read_arguments(char **argv)
 	job.pid = (pid_t)number(argv[1], "PID");
 	job.timeout_ms = number(argv[2], "TIMEOUT_MS");
 	error_fd = (int)number(argv[3], "ERROR_FD");
-	fd = (int)number(argv[4], "ENV_FD");
+	read_environment((int)number(argv[4], "ENV_FD"));
 	errno = EINVAL;
 	must(sscanf(argv[5], "%u:%u:%llx:%llx:%llx:%llx:%llx:%u", &job.uid, &job.gid,
 		    &job.inheritable, &job.permitted, &job.effective, &job.bounding, &job.ambient,
 		    &nnp) == 8,
 	     "CREDENTIALS");
 	job.no_new_privs = nnp;
-	count = number(argv[6], "NGROUPS");
-	argv += 7;
-	for (; count > 0; count--) {
-		char **next = take(argv, "GROUP");
-
-		errno = E2BIG;
-		must(job.group_count < GROUPS_MAX, "GROUP");
-		job.groups[job.group_count++] = (gid_t)number(*argv, "GROUP");
-		argv = next;
-	}
-	take(argv, "NCGROUPS");
-	count = number(*argv++, "NCGROUPS");
-	for (; count > 0; count--) {
-		char **next = take(argv, "FILE");
-
-		errno = E2BIG;
-		must(job.cgroup_count < CGROUPS_MAX, "FILE");
-		job.cgroup_fds[job.cgroup_count] = open(*argv, O_WRONLY | O_CLOEXEC);
-		must(job.cgroup_fds[job.cgroup_count++] >= 0, *argv);
-		argv = next;
-	}
+	argv = read_cgroups(read_groups(argv + 6));
 	take(argv, "COMMAND");
 	job.command = argv;
-
-	/* The environment is for the command, not for us: it can hold variables that affect our own
-	 * C library. */
-	{
-		struct stat st;
-		char *text;
-		size_t n = 0, i = 0;
-
-		must(fstat(fd, &st) == 0, "ENV_FD");
-		errno = E2BIG;
-		must(st.st_size <= ENVIRONMENT_MAX, "ENV_FD");
-		text = calloc(1, (size_t)st.st_size + 1);
-		must(text != NULL, "calloc");
-		must(pread(fd, text, (size_t)st.st_size, 0) == st.st_size, "ENV_FD");
-		for (off_t at = 0; at < st.st_size; at++)
-			n += text[at] == '\0';
-		job.env = calloc(n + 2, sizeof *job.env);
-		must(job.env != NULL, "calloc");
-		for (char *at = text; at < text + st.st_size && i <= n; at += strlen(at) + 1)
-			job.env[i++] = at;
-	}
 }
 
 /* The filters of the container's main process. The kernel shows them only to a tracer, so it is

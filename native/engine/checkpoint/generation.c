@@ -152,111 +152,123 @@ static void fill_ended(const struct image *image)
 		block->name[strcspn(block->name, "\n")] = 0;
 }
 
-/* Fills the slot in from what freeze_tree() has read: one block per thread. */
-static int fill_slot(struct image *image, struct avc_error *err)
+/* A child can have exited since the freeze; its template has what it had. */
+static int read_status(const struct image *image, struct proc_status *status, struct avc_error *err)
 {
-	struct process *process = image->process;
-	const struct parasite *parasite = &process->parasite;
-	struct inj_slot *slot = parasite_slot(parasite, image->slot);
-	const struct thread *main_thread = thread_find(process, process->pid);
-	const struct proc_stat *stat = &image->stat;
-	struct proc_status status;
-	struct setup setup;
-	int mem_fd;
+	const struct process *process = image->process;
 
-	/* A child can have exited since the freeze. */
-	if (proc_status_of(process->status_fd, process->pid, &status) == 0)
-		file_rights_note(&image->files->rights, process->pid, &status);
-	else if (process->descendant && proc_status(image->template, &status) == 0)
-		file_rights_note(&image->files->rights, image->template, &status);
+	if (proc_status_of(process->status_fd, process->pid, status) == 0)
+		file_rights_note(&image->files->rights, process->pid, status);
+	else if (process->descendant && proc_status(image->template, status) == 0)
+		file_rights_note(&image->files->rights, image->template, status);
 	else
 		return fail_errno(err, process->pid, "keep template", "open(status)",
 				  "it has ended");
-	if (status.seccomp_filters > process->filters) /* one that has ended has none */
+	if (status->seccomp_filters > process->filters) /* one that has ended has none */
 		return fail(err, AVC_RETRY, 0, process->pid, "keep template", "",
 			    "its seccomp filters have just changed");
-	image->headless = process->pid != process->leader;
-	image->stop_signal = main_thread->stop_signal;
-	image->stop_heard = process->stop_heard;
-	setup_begin(&setup, parasite, image->slot);
-	if (filters_setup(image, main_thread, &setup, err))
-		return -1;
-	mem_fd = process->thread_count > 1 ? proc_open(image->template, "mem", O_RDONLY) : -1;
-	if (process->thread_count > 1 && mem_fd < 0)
-		return fail_errno(err, image->template, "keep template", "open(mem)",
-				  "it was killed");
-	for (uint32_t i = 0; i < process->thread_count; i++) {
-		struct thread t = process->threads[i];
-		const uint32_t b = (uint32_t)t.block;
-		struct inj_thread *block;
-		uint8_t *frame;
+	return 0;
+}
 
-		if (t.block < 0)
+/* What the restored thread is made of.  `mem_fd`: the template's memory. */
+static struct inj_thread *fill_block(const struct image *image, const struct thread *thread,
+				     int mem_fd)
+{
+	const struct process *process = image->process;
+	const struct parasite *parasite = &process->parasite;
+	const uint32_t b = (uint32_t)thread->block;
+	struct inj_thread *block = parasite_thread(parasite, image->slot, b);
+	uint8_t *frame = parasite_frame(parasite, image->slot, b);
+	const bool cloned = thread->tid == process->pid;
+	struct thread t = *thread;
+
+	/* The borrowed thread's was handled when it was borrowed; its memory has changed since. */
+	if (!cloned)
+		thread_fix_rseq(mem_fd, &t);
+	rewind_original(&t, &t.regs);
+	arch_rewind(&t.regs);
+	*block = (struct inj_thread){
+		.frame = arch_frame_build(frame, parasite_remote(parasite, frame), &t.regs,
+					  t.sigmask, t.altstack),
+		.stack = parasite_remote(parasite, parasite_stack(parasite, image->slot, b)) - 16,
+		.tls = arch_tls(&t.regs),
+		.clear_tid = t.clear_tid,
+		.robust_list = t.robust_list,
+		.robust_bytes = t.robust_bytes,
+		.rseq = t.rseq,
+		.rseq_bytes = t.rseq_bytes,
+		.rseq_signature = t.rseq_signature,
+		.other_base = arch_other_base(&t.regs),
+		.large_state = arch_frame_needs_room(frame) ? parasite_remote(parasite, frame) : 0,
+		.tid = t.inside,
+		.affinity_bytes = t.affinity_bytes,
+	};
+	memcpy(block->affinity, t.affinity, sizeof block->affinity);
+	/* Of the thread that was cloned, as of then. */
+	memcpy(block->name,
+	       cloned && !process->descendant && !image->recycled
+		       ? (char *)parasite_slot(parasite, image->slot)->template_call.out +
+				 TEMPLATE_NAME
+		       : t.name,
+	       sizeof block->name);
+	return block;
+}
+
+static int fill_threads(const struct image *image, const struct thread *main_thread,
+			struct setup *setup, struct avc_error *err)
+{
+	const struct process *process = image->process;
+	int mem_fd = -1, result = 0;
+
+	if (process->thread_count > 1) {
+		mem_fd = proc_open(image->template, "mem", O_RDONLY);
+		if (mem_fd < 0)
+			return fail_errno(err, image->template, "keep template", "open(mem)",
+					  "it was killed");
+	}
+	for (uint32_t i = 0; i < process->thread_count && !result; i++) {
+		const struct thread *thread = &process->threads[i];
+
+		if (thread->block < 0)
 			continue;
-		block = parasite_thread(parasite, image->slot, b);
-		frame = parasite_frame(parasite, image->slot, b);
-
-		/* The borrowed thread's was handled when it was borrowed; its memory has changed
-		 * since. */
-		if (t.tid != process->pid)
-			thread_fix_rseq(mem_fd, &t);
-		rewind_original(&t, &t.regs);
-		arch_rewind(&t.regs);
-		*block = (struct inj_thread){
-			.frame = arch_frame_build(frame, parasite_remote(parasite, frame), &t.regs,
-						  t.sigmask, t.altstack),
-			.stack = parasite_remote(parasite,
-						 parasite_stack(parasite, image->slot, b)) -
-				 16,
-			.tls = arch_tls(&t.regs),
-			.clear_tid = t.clear_tid,
-			.robust_list = t.robust_list,
-			.robust_bytes = t.robust_bytes,
-			.rseq = t.rseq,
-			.rseq_bytes = t.rseq_bytes,
-			.rseq_signature = t.rseq_signature,
-			.other_base = arch_other_base(&t.regs),
-			.large_state =
-				arch_frame_needs_room(frame) ? parasite_remote(parasite, frame) : 0,
-			.tid = t.inside,
-			.affinity_bytes = t.affinity_bytes,
-		};
-		memcpy(block->affinity, t.affinity, sizeof block->affinity);
-		/* Of the thread that was cloned, as of then. */
-		memcpy(block->name,
-		       !process->descendant && !image->recycled && t.tid == process->pid
-			       ? (char *)slot->template_call.out + TEMPLATE_NAME
-			       : t.name,
-		       sizeof block->name);
-		setup_thread(&setup, block);
-		if (attributes_setup_thread(process, main_thread, &process->threads[i], &setup,
-					    err)) {
-			close_fd(&mem_fd);
-			return -1;
-		}
-		pending_setup_thread(process, &t, &setup);
-		filters_setup_thread(image, &process->threads[i], &setup);
+		setup_thread(setup, fill_block(image, thread, mem_fd));
+		result = attributes_setup_thread(process, main_thread, thread, setup, err);
+		pending_setup_thread(process, thread, setup);
+		filters_setup_thread(image, thread, setup);
 	}
 	close_fd(&mem_fd);
-	if (image->headless)
-		fill_ended(image);
-	image->sandboxed = image->installs ||
-			   !seccomp_is_containers(&status, process->plain_filters);
-	if (memory_finish(image, status.locked_kb, &setup, err))
+	return result;
+}
+
+/* What belongs to all of its threads. */
+static int fill_process(struct image *image, const struct proc_status *status, struct setup *setup,
+			struct avc_error *err)
+{
+	struct process *process = image->process;
+
+	if (memory_finish(image, status->locked_kb, setup, err))
 		return -1;
-	pending_setup(process, &setup);
+	pending_setup(process, setup);
 	if (attributes_keep(image, err))
 		return -1;
-	timers_setup(process, &status, &setup);
+	timers_setup(process, status, setup);
 	if (process->descendant)
-		process_attrs_setup_limits(image, &setup);
+		process_attrs_setup_limits(image, setup);
 	/* A change of users clears it for the whole process, whichever thread makes it. */
 	if (image->dumpable == 0 || image->dumpable == 1)
-		setup_add(&setup, INJ_AFTER, "", SYS_prctl, PR_SET_DUMPABLE,
+		setup_add(setup, INJ_AFTER, "", SYS_prctl, PR_SET_DUMPABLE,
 			  (uint64_t)image->dumpable)
 			->flags = INJ_MAY_FAIL;
-	if (setup.notice.code)
-		image->notice = setup.notice;
+	return 0;
+}
+
+/* The slot's own: whose number, group and terminal the restored process takes. */
+static void fill_header(const struct image *image)
+{
+	const struct process *process = image->process;
+	const struct proc_stat *stat = &image->stat;
+	struct inj_slot *slot = parasite_slot(&process->parasite, image->slot);
+
 	slot->threads = image->threads;
 	slot->pid = process->inside;
 	/* Only the app's own group, or one whose leader is visible, can be restored. */
@@ -268,6 +280,34 @@ static int fill_slot(struct image *image, struct avc_error *err)
 				       (slot->session_leader || stat->tty_group == stat->group)
 			       ? files_find_device(image->files, stat->tty)
 			       : -1;
+}
+
+/* Fills the slot in from what freeze_tree() has read: one block per thread. */
+static int fill_slot(struct image *image, struct avc_error *err)
+{
+	struct process *process = image->process;
+	const struct thread *main_thread = thread_find(process, process->pid);
+	struct proc_status status;
+	struct setup setup;
+
+	if (read_status(image, &status, err))
+		return -1;
+	image->headless = process->pid != process->leader;
+	image->stop_signal = main_thread->stop_signal;
+	image->stop_heard = process->stop_heard;
+	setup_begin(&setup, &process->parasite, image->slot);
+	if (filters_setup(image, main_thread, &setup, err) ||
+	    fill_threads(image, main_thread, &setup, err))
+		return -1;
+	if (image->headless)
+		fill_ended(image);
+	image->sandboxed = image->installs ||
+			   !seccomp_is_containers(&status, process->plain_filters);
+	if (fill_process(image, &status, &setup, err))
+		return -1;
+	if (setup.notice.code)
+		image->notice = setup.notice;
+	fill_header(image);
 	return setup_end(&setup, process->pid, err);
 }
 

@@ -617,77 +617,98 @@ static int await_gathered(struct tables *tables, struct avc_error *err)
 	return result;
 }
 
-int files_restore(struct image *image, uint32_t images, const struct avc_config *config, pid_t init,
-		  struct avc_error *notes, struct avc_error *err)
+/* One work for each table, and what of it is still there. */
+static int tables_begin(struct tables *tables, struct image *image, uint32_t images,
+			const struct files_work *common, struct avc_error *err)
 {
-	struct tables tables = { .work = calloc(images, sizeof *tables.work) };
-	struct avc_error ignored = { 0 };
-	int result = -1, dropped = 0;
-
-	if (!tables.work)
-		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
-	files_find_strange(image, images, config);
 	for (uint32_t i = 0; i < images; i++) {
 		const struct process *process = image[i].process;
 		/* The table of one that had exited before is gone. */
 		const bool held = process && process->descendant;
+		struct files_work *work = &tables->work[tables->count];
 
 		if (!process || image[i].shared & CLONE_FILES)
 			continue;
-		tables.work[tables.count++] = (struct files_work){
-			.host = held ? work_of(&tables,
-					       image[image_table_owner(image, image[i].host)]
-						       .process)
-				     : NULL,
-			.process = image[i].process,
-			.image = &image[i],
-			.config = config,
-			.init = init,
-			.table = held ? process->holder : image[i].template,
-			.table_pidfd = held ? process->holder_pidfd : image[i].pidfd,
-			.want = image[i].files,
-			.notes = notes,
-		};
-		if (files_work_begin(&tables.work[tables.count - 1], err))
-			goto out;
+		*work = *common;
+		work->process = image[i].process;
+		work->image = &image[i];
+		work->table = held ? process->holder : image[i].template;
+		work->table_pidfd = held ? process->holder_pidfd : image[i].pidfd;
+		work->want = image[i].files;
+		if (held)
+			work->host = work_of(
+				tables, image[image_table_owner(image, image[i].host)].process);
+		tables->count++;
+		if (files_work_begin(work, err))
+			return -1;
 	}
-	for (uint32_t i = 0; i < tables.count; i++)
-		if (files_work_gather(&tables.work[i], err))
-			goto out;
-	if (await_gathered(&tables, err))
-		goto out;
-	if (list_spots(&tables, &tables.ends, false) || list_spots(&tables, &tables.family, true)) {
-		result = fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
-		goto out;
-	}
-	see_to_pairs(&tables, true);
-	if (tables.count > 1)
-		join(&tables);
-	for (uint32_t i = 0; i < tables.count; i++) {
+	for (uint32_t i = 0; i < tables->count; i++)
+		if (files_work_gather(&tables->work[i], err))
+			return -1;
+	return await_gathered(tables, err);
+}
+
+/* Those of one table come from where they still are. */
+static int place(struct tables *tables, struct avc_error *err)
+{
+	if (list_spots(tables, &tables->ends, false) || list_spots(tables, &tables->family, true))
+		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+	see_to_pairs(tables, true);
+	if (tables->count > 1)
+		join(tables);
+	for (uint32_t i = 0; i < tables->count; i++) {
 		if (i)
-			join_family(&tables, &tables.work[i]);
-		if (files_work_place(&tables.work[i], err))
-			goto out;
+			join_family(tables, &tables->work[i]);
+		if (files_work_place(&tables->work[i], err))
+			return -1;
 	}
-	put_contents(&tables);
-	if (config->again & AVC_AGAIN_DROP_INPUT)
-		dropped = drop_input(&tables);
-	see_to_pairs(&tables, false);
-	for (uint32_t i = 0; i < tables.count; i++) {
-		struct files_work *work = &tables.work[i];
+	return 0;
+}
+
+static int tables_finish(struct tables *tables, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < tables->count; i++) {
+		struct files_work *work = &tables->work[i];
 
 		files_work_finish(work);
 		if (work->process->descendant && files_work_table(work, &work->image->table, err))
-			goto out;
+			return -1;
 	}
-	result = dropped;
-out:
-	if (result < 0)
+	return 0;
+}
+
+static void tables_end(struct tables *tables)
+{
+	for (uint32_t i = 0; i < tables->count; i++)
+		files_work_end(&tables->work[i]);
+	free(tables->ends.spot);
+	free(tables->family.spot);
+	free(tables->work);
+}
+
+int files_restore(struct image *image, uint32_t images, const struct avc_config *config, pid_t init,
+		  struct avc_error *notes, struct avc_error *err)
+{
+	const struct files_work common = { .config = config, .init = init, .notes = notes };
+	struct tables tables = { .work = calloc(images, sizeof *tables.work) };
+	struct avc_error ignored = { 0 };
+	int result, dropped = 0;
+
+	if (!tables.work)
+		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
+	files_find_strange(image, images, config);
+	result = tables_begin(&tables, image, images, &common, err);
+	if (!result)
+		result = place(&tables, err);
+	if (!result) {
+		put_contents(&tables);
+		if (config->again & AVC_AGAIN_DROP_INPUT)
+			dropped = drop_input(&tables);
+		see_to_pairs(&tables, false);
+		result = tables_finish(&tables, err);
+	}
+	if (result)
 		(void)await_gathered(&tables, &ignored);
-	for (uint32_t i = 0; i < tables.count; i++)
-		files_work_end(&tables.work[i]);
-	free(tables.ends.spot);
-	free(tables.family.spot);
-	free(tables.work);
-	return result;
+	tables_end(&tables);
+	return result ? -1 : dropped;
 }

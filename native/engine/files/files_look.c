@@ -232,14 +232,55 @@ bool files_clock_was_set(const struct files *files)
 	return llabs(shown - passed) > (int64_t)SET_NS + passed / SLEW;
 }
 
+/* Which files init's stdio is: is_inits(). */
+static void look_at_init(struct look *look)
+{
+	for (int i = 0; i < 3; i++) {
+		char name[8];
+		struct statx st;
+
+		snprintf(name, sizeof name, "fd/%d", i);
+		if (!proc_look(look->init, name, STATX_INO, &st))
+			continue;
+		look->init_stdio[i].dev = makedev(st.stx_dev_major, st.stx_dev_minor);
+		look->init_stdio[i].ino = st.stx_ino;
+	}
+}
+
+static int walk_as_deep(struct look *look, struct avc_error *err)
+{
+	const struct files *files = look->files, *known = look->known;
+
+	if (files->missing && !files->missing->count)
+		return walk_known(look, err);
+	if (look->depth == FILES_FROZEN && known && known->count <= files->room)
+		return walk_frozen(look, err);
+	if (look->depth == FILES_BEFORE)
+		return walk_before(look, err);
+	return walk(look, 0, err);
+}
+
+static int check_allowed(const struct look *look, struct avc_error *err)
+{
+	const dev_t fuse = makedev(MISC_MAJOR, FUSE_MINOR);
+	const char *why = NULL;
+
+	if (look->depth == FILES_BEFORE && look->refuses)
+		why = look->refuses;
+	else if (look->depth != FILES_NOW && files_find_device(look->files, fuse) >= 0)
+		why = files_serves;
+	return why ? fail(err, AVC_UNSUPPORTED, 0, look->pid, "look at descriptors", "", "%s", why)
+		   : 0;
+}
+
 int files_look(struct files *files, const struct files_owner *owner, enum files_depth depth,
 	       struct files *known, struct avc_error *err)
 {
-	const pid_t pid = owner->pid, init = owner->init;
+	const pid_t pid = owner->pid;
 	struct look look = { .files = files,
 			     .known = known,
 			     .pid = pid,
-			     .init = init,
+			     .init = owner->init,
 			     .pidfd = owner->pidfd,
 			     .later = SOCKETS_LATER,
 			     .reuses = owner->reuses,
@@ -251,40 +292,18 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 	look.fd_dir = proc_open(pid, "fd", O_RDONLY | O_DIRECTORY);
 	if (look.fd_dir < 0)
 		return fail_errno(err, pid, "look at descriptors", "open(fd)", "it has ended");
-	for (int i = 0; i < 3 && depth != FILES_FROZEN && init; i++) {
-		char name[8];
-		struct statx st;
-
-		snprintf(name, sizeof name, "fd/%d", i);
-		if (!proc_look(init, name, STATX_INO, &st))
-			continue;
-		look.init_stdio[i].dev = makedev(st.stx_dev_major, st.stx_dev_minor);
-		look.init_stdio[i].ino = st.stx_ino;
-	}
+	if (depth != FILES_FROZEN && look.init)
+		look_at_init(&look);
 	files->count = 0;
 	files->mounts = depth == FILES_BEFORE ? mounts_stamp(pid) : 0;
 	read_clocks(&files->taken_ns, &files->boot_ns);
-	if (files->missing && !files->missing->count)
-		result = walk_known(&look, err);
-	else if (depth == FILES_FROZEN && known && known->count <= files->room)
-		result = walk_frozen(&look, err);
-	else if (depth == FILES_BEFORE)
-		result = walk_before(&look, err);
-	else
-		result = walk(&look, 0, err);
+	result = walk_as_deep(&look, err);
 	if (depth == FILES_NOW)
 		files->open = size_of_table(&look);
 	close(look.fd_dir);
 	files->served = depth == FILES_BEFORE ? may_be_served(&look) : known && known->served;
 	mounts_free(&look.mounts);
-	if (!result && depth == FILES_BEFORE && look.refuses)
-		result = fail(err, AVC_UNSUPPORTED, 0, pid, "look at descriptors", "", "%s",
-			      look.refuses);
-	if (!result && depth != FILES_NOW &&
-	    files_find_device(files, makedev(MISC_MAJOR, FUSE_MINOR)) >= 0)
-		result = fail(err, AVC_UNSUPPORTED, 0, pid, "look at descriptors", "", "%s",
-			      files_serves);
-	if (result) {
+	if (result || check_allowed(&look, err)) {
 		for (uint32_t i = 0; i < files->count; i++)
 			file_drop_ours(&files->file[i]);
 		return -1;

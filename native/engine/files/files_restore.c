@@ -608,12 +608,38 @@ static int set_cloexec(struct files_work *work, struct avc_error *err)
 struct numbers {
 	uint8_t *taken;
 	int room;
+	int low; /* all below are */
 };
 
-static int lowest_free(const struct numbers *numbers, const struct files *avoid)
+/* Room for all that are wanted, and for some more while they are handed over. */
+static int numbers_begin(struct numbers *numbers, const struct files_work *work,
+			 struct avc_error *err)
+{
+	const struct files *want = work->want;
+
+	numbers->room = 16 + (want->count ? want->file[want->count - 1].fd : 0);
+	numbers->taken = calloc((size_t)numbers->room, 1);
+	if (!numbers->taken)
+		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
+	for (uint32_t i = 0; i < work->now->count; i++)
+		if (!work->closed[i])
+			numbers->taken[work->now->file[i].fd] = 1;
+	return 0;
+}
+
+/* The one that the kernel assigns next. */
+static int lowest_free(struct numbers *numbers)
+{
+	while (numbers->low < numbers->room && numbers->taken[numbers->low])
+		numbers->low++;
+	return numbers->low < numbers->room ? numbers->low : -1;
+}
+
+/* One that nothing of the checkpoint has. */
+static int free_beside(const struct numbers *numbers, const struct files *want)
 {
 	for (int fd = 0; fd < numbers->room; fd++)
-		if (!numbers->taken[fd] && !(avoid && files_find(avoid, fd)))
+		if (!numbers->taken[fd] && !files_find(want, fd))
 			return fd;
 	return -1;
 }
@@ -641,7 +667,7 @@ static int receive(struct files_work *work, struct numbers *numbers, int ours, i
 		if (!work->lost[i] || from < 0)
 			continue;
 		(void)budget_step();
-		to = lowest_free(numbers, NULL);
+		to = lowest_free(numbers);
 		/* Descriptors not yet received wait in the socket, which holds some hundred. */
 		if (fd_send(ours, from) &&
 		    (errno != EAGAIN || files_work_flush(work, err) || fd_send(ours, from))) {
@@ -664,28 +690,58 @@ static int receive(struct files_work *work, struct numbers *numbers, int ours, i
 	return 0;
 }
 
+/* A pair of sockets: `ours` here, and `theirs`, a number in their table that is in nobody's way. */
+static int begin_handing_over(struct files_work *work, struct numbers *numbers, int *ours,
+			      int *theirs, struct avc_error *err)
+{
+	struct inj_call *call = call_of(work);
+	int32_t ends[2];
+
+	call_add(call, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0,
+		 parasite_remote(&work->process->parasite, call->out));
+	if (files_work_flush(work, err))
+		return -1;
+	memcpy(ends, call->out, sizeof ends);
+	if (call->call[0].result || ends[0] < 0 || ends[0] >= numbers->room || ends[1] < 0 ||
+	    ends[1] >= numbers->room)
+		return fail(err, AVC_KERNEL, (int)-call->call[0].result, work->process->inside,
+			    "restore descriptors", "socketpair",
+			    "descriptors could not be handed over");
+	*ours = proc_borrow_fd(work->image->pidfd, ends[1]);
+	if (*ours < 0)
+		return fail_errno(err, work->image->template, "restore descriptors", "pidfd_getfd",
+				  "descriptors could not be handed over");
+	numbers->taken[ends[0]] = numbers->taken[ends[1]] = 1;
+	*theirs = free_beside(numbers, work->want);
+	numbers->taken[ends[0]] = numbers->taken[ends[1]] = 0;
+	numbers->taken[*theirs] = 1;
+	return inject(work, err, SYS_fcntl, (uint64_t)ends[0], F_DUPFD_CLOEXEC,
+		      (uint64_t)*theirs) ||
+			       inject(work, err, SYS_close, (uint64_t)ends[0], 0, 0) ||
+			       inject(work, err, SYS_close, (uint64_t)ends[1], 0, 0)
+		       ? -1
+		       : 0;
+}
+
+static bool any_lost(const struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++)
+		if (work->lost[i] &&
+		    work->local[files_leader(work->want, &work->want->file[i])] >= 0)
+			return true;
+	return false;
+}
+
 static int put_lost(struct files_work *work, struct avc_error *err)
 {
 	struct rlimit limit = { RLIM_INFINITY, RLIM_INFINITY };
-	const struct parasite *parasite = &work->process->parasite;
-	struct inj_call *call = call_of(work);
-	struct numbers numbers = { .room = 16 };
-	int32_t ends[2];
-	int ours, theirs, result = -1;
-	bool any = false;
+	struct numbers numbers = { 0 };
+	int ours = -1, theirs = -1, result = -1;
 
-	for (uint32_t i = 0; i < work->want->count; i++)
-		any |= work->lost[i] &&
-		       work->local[files_leader(work->want, &work->want->file[i])] >= 0;
-	if (!any)
+	if (!any_lost(work))
 		return 0;
-	numbers.room += work->want->count ? work->want->file[work->want->count - 1].fd : 0;
-	numbers.taken = calloc((size_t)numbers.room, 1);
-	if (!numbers.taken)
-		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
-	for (uint32_t i = 0; i < work->now->count; i++)
-		if (!work->closed[i])
-			numbers.taken[work->now->file[i].fd] = 1;
+	if (numbers_begin(&numbers, work, err))
+		return -1;
 	if (files_work_flush(work, err))
 		goto out;
 	/* Passing descriptors takes some more, and one may have a number above the current
@@ -693,39 +749,14 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 	if (prlimit(work->table, RLIMIT_NOFILE, NULL, &limit) == 0 &&
 	    limit.rlim_cur < (rlim_t)numbers.room)
 		process_attrs_lift_limit(work->table, RLIMIT_NOFILE, (uint64_t)numbers.room);
-	call_add(call, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0,
-		 parasite_remote(parasite, call->out));
-	if (files_work_flush(work, err))
-		goto out;
-	memcpy(ends, call->out, sizeof ends);
-	if (call->call[0].result || ends[0] < 0 || ends[0] >= numbers.room || ends[1] < 0 ||
-	    ends[1] >= numbers.room) {
-		fail(err, AVC_KERNEL, (int)-call->call[0].result, work->process->inside,
-		     "restore descriptors", "socketpair", "descriptors could not be handed over");
-		goto out;
-	}
-	numbers.taken[ends[0]] = numbers.taken[ends[1]] = 1;
-	theirs = lowest_free(&numbers, work->want);
-	ours = proc_borrow_fd(work->image->pidfd, ends[1]);
-	if (ours < 0) {
-		fail_errno(err, work->image->template, "restore descriptors", "pidfd_getfd",
-			   "descriptors could not be handed over");
-		goto out;
-	}
-	numbers.taken[ends[0]] = numbers.taken[ends[1]] = 0;
-	numbers.taken[theirs] = 1;
-	if (inject(work, err, SYS_fcntl, (uint64_t)ends[0], F_DUPFD_CLOEXEC, (uint64_t)theirs) ||
-	    inject(work, err, SYS_close, (uint64_t)ends[0], 0, 0) ||
-	    inject(work, err, SYS_close, (uint64_t)ends[1], 0, 0) ||
-	    receive(work, &numbers, ours, theirs, err) ||
-	    inject(work, err, SYS_close, (uint64_t)theirs, 0, 0) || files_work_flush(work, err))
-		result = -1;
-	else
-		result = 0;
-	close(ours);
-out:
+	if (begin_handing_over(work, &numbers, &ours, &theirs, err) == 0 &&
+	    receive(work, &numbers, ours, theirs, err) == 0 &&
+	    inject(work, err, SYS_close, (uint64_t)theirs, 0, 0) == 0)
+		result = files_work_flush(work, err);
+	close_fd(&ours);
 	if (limit.rlim_cur < (rlim_t)numbers.room)
 		prlimit(work->table, RLIMIT_NOFILE, &limit, NULL);
+out:
 	free(numbers.taken);
 	return result;
 }

@@ -544,6 +544,48 @@ static void let_go(struct avc_guard *guard)
 	close_fd(&guard->channel.init_pidfd);
 }
 
+/* Whoever has ended, and what the daemon asks for.  True: init has ended. */
+static bool hear(struct avc_guard *guard, bool news)
+{
+	if (news && guard->foreseen != guard->main.pid && pidfd_ended(guard->main.pidfd))
+		guard_app_dies(guard);
+	if (news || now_ns() >= tracee_ending_due())
+		guard_reap_dead(guard);
+	else
+		dirty_drop_ended(&guard->dirty); /* of which no descriptor is watched */
+	guard_tend_remains(guard);
+	(void)guard_let_executed_go(guard, false);
+	if (news)
+		guard_let_ended_go(guard);
+	if (news && pidfd_ended(guard->channel.init_pidfd))
+		return true;
+	if (news)
+		carry_out(guard);
+	if (guard->dead.waits)
+		guard_tend_dead(guard);
+	return false;
+}
+
+/* What is due. */
+static void work(struct avc_guard *guard)
+{
+	guard_pace_listen(guard);
+	if (now_ns() >= guard_tell_due(guard))
+		guard_tell_untold(guard);
+	if (now_ns() >= guard->ahead_ns && tracee_ending_pidfd(0) < 0)
+		guard_work_ahead(guard);
+	if (now_ns() >= faults_due(&guard->faults, &guard->tree, guard->next_ns))
+		faults_arm(&guard->faults, &guard->tree);
+	if (now_ns() < guard->next_ns)
+		return;
+	if (!guard->attached)
+		attach(guard);
+	else if (guard_tend_stragglers(guard))
+		tell_straggling(guard);
+	else if (guard_pace_wants(guard) && !put_off(guard))
+		guard_checkpoint(guard, 0);
+}
+
 static void guard_main(struct avc_guard *guard)
 {
 	struct avc_error error = { 0 };
@@ -574,41 +616,10 @@ static void guard_main(struct avc_guard *guard)
 			guard_app_died(guard, &report);
 			continue;
 		}
-		if (news && guard->foreseen != guard->main.pid && pidfd_ended(guard->main.pidfd))
-			guard_app_dies(guard);
-		if (news || now_ns() >= tracee_ending_due())
-			guard_reap_dead(guard);
-		else
-			dirty_drop_ended(&guard->dirty); /* of which no descriptor is watched */
-		guard_tend_remains(guard);
-		(void)guard_let_executed_go(guard, false);
-		if (news)
-			guard_let_ended_go(guard);
-		if (news && pidfd_ended(guard->channel.init_pidfd)) {
-			ended = true;
+		ended = hear(guard, news);
+		if (ended || (!guard->dead.waits && seccomp_must_suspend()))
 			break;
-		}
-		if (news)
-			carry_out(guard);
-		if (guard->dead.waits)
-			guard_tend_dead(guard);
-		else if (seccomp_must_suspend())
-			break;
-		guard_pace_listen(guard);
-		if (now_ns() >= guard_tell_due(guard))
-			guard_tell_untold(guard);
-		if (now_ns() >= guard->ahead_ns && tracee_ending_pidfd(0) < 0)
-			guard_work_ahead(guard);
-		if (now_ns() >= faults_due(&guard->faults, &guard->tree, guard->next_ns))
-			faults_arm(&guard->faults, &guard->tree);
-		if (now_ns() < guard->next_ns)
-			continue;
-		if (!guard->attached)
-			attach(guard);
-		else if (guard_tend_stragglers(guard))
-			tell_straggling(guard);
-		else if (guard_pace_wants(guard) && !put_off(guard))
-			guard_checkpoint(guard, 0);
+		work(guard);
 	}
 	guard_tell_untold(guard);
 	let_go(guard);

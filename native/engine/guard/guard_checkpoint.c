@@ -667,11 +667,49 @@ static void try_soon(struct avc_guard *guard)
 	let_it_run(guard);
 }
 
+/* What the attempt had found out is in `event`. */
+static void miss(struct avc_guard *guard, uint64_t ticket, struct avc_event *event,
+		 const struct avc_error *error)
+{
+	guard_pace_missed(guard);
+	faults_settle(&guard->faults, &guard->tree, guard->next_ns);
+	if (seccomp_must_suspend()) {
+		guard->next_ns = now_ns(); /* guard_main() ends it, which is told */
+		if (!ticket)
+			return;
+	}
+	if (error->code == AVC_GONE)
+		guard->dying_until_ns = now_ns() + DYING_NS;
+	/* If the app has died, init's report follows: only a command needs an answer. */
+	if (error->code == AVC_GONE && guard->main.pid && pidfd_ended(guard->main.pidfd)) {
+		if (ticket)
+			guard_emit_error(guard, AVC_EVENT_MISSED, ticket, error);
+		return;
+	}
+	if (policy_missed(&guard->policy, error->code, error->pid == guard->main.pid, now_ns())) {
+		if (!seccomp_must_suspend())
+			guard->next_ns = policy_refused(&guard->policy, guard->next_ns, now_ns());
+		guard_unprotect(guard, ticket, error);
+		return;
+	}
+	try_soon(guard);
+	/* At a limit of its own (RLIMIT_NPROC) the app needs them more, and each attempt makes clone(2)
+	 * fail for it. */
+	if (error->code == AVC_LIMIT && !guard->count) {
+		let_go_of_holders(guard);
+		guard->next_ns = policy_refused(&guard->policy, guard->next_ns, now_ns());
+	}
+	event->kind = AVC_EVENT_MISSED;
+	event->generations = guard->count; /* with a new parasite, all may have been dropped */
+	event->ticket = ticket;
+	event->error = *error;
+	guard_emit(guard, event);
+}
+
 void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_CHECKPOINT);
 	struct avc_error error = { 0 };
-	bool taken;
 
 	guard->next_ns = policy_due(&guard->config, now_ns());
 	if (init_channel_stop_asked(&guard->channel)) {
@@ -697,49 +735,16 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 	if (ticket)
 		policy_retry(&guard->policy);
 	guard_pace_begin(guard);
-	taken = take(guard, &event, &error) == 0;
-	if (taken) {
-		event.ticket = ticket;
-		event.app_pid = guard->main.leader;
-		event.app_pid_inside = guard->main.inside;
-		guard_pace_taken(guard, &event);
-		let_it_run(guard);
-		faults_settle(&guard->faults, &guard->tree, guard->next_ns);
-		guard_tell_taken(guard, &event);
-		guard->unprotected = false;
+	if (take(guard, &event, &error)) {
+		miss(guard, ticket, &event, &error);
 		return;
 	}
-	guard_pace_missed(guard);
-	faults_settle(&guard->faults, &guard->tree, guard->next_ns);
-	if (seccomp_must_suspend()) {
-		guard->next_ns = now_ns(); /* guard_main() ends it, which is told */
-		if (!ticket)
-			return;
-	}
-	if (error.code == AVC_GONE)
-		guard->dying_until_ns = now_ns() + DYING_NS;
-	/* If the app has died, init's report follows: only a command needs an answer. */
-	if (error.code == AVC_GONE && guard->main.pid && pidfd_ended(guard->main.pidfd)) {
-		if (ticket)
-			guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
-		return;
-	}
-	if (policy_missed(&guard->policy, error.code, error.pid == guard->main.pid, now_ns())) {
-		if (!seccomp_must_suspend())
-			guard->next_ns = policy_refused(&guard->policy, guard->next_ns, now_ns());
-		guard_unprotect(guard, ticket, &error);
-		return;
-	}
-	try_soon(guard);
-	/* At a limit of its own (RLIMIT_NPROC) the app needs them more, and each attempt makes clone(2)
-	 * fail for it. */
-	if (error.code == AVC_LIMIT && !guard->count) {
-		let_go_of_holders(guard);
-		guard->next_ns = policy_refused(&guard->policy, guard->next_ns, now_ns());
-	}
-	event.kind = AVC_EVENT_MISSED;
-	event.generations = guard->count; /* with a new parasite, all may have been dropped */
 	event.ticket = ticket;
-	event.error = error;
-	guard_emit(guard, &event);
+	event.app_pid = guard->main.leader;
+	event.app_pid_inside = guard->main.inside;
+	guard_pace_taken(guard, &event);
+	let_it_run(guard);
+	faults_settle(&guard->faults, &guard->tree, guard->next_ns);
+	guard_tell_taken(guard, &event);
+	guard->unprotected = false;
 }

@@ -247,16 +247,55 @@ static void reap_tracees(void *arg)
 	guard_reap_unknown(guard);
 }
 
-bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
-		      enum avc_reason reason, uint32_t had, struct avc_error *error)
+/* `ending`: templates have been killed, and may not have ended yet. */
+static int restore_newest(struct avc_guard *guard, struct restore *restore, bool ending,
+			  bool *whole, struct avc_error *err)
+{
+	struct generation *generation = restore->generation;
+	int result;
+
+	release_new(guard, generation);
+	/* Nor may templates lost by this death keep anything open.  And where processes are limited,
+	 * they count, as spares do. */
+	if (ending)
+		guard_wait_ended(guard);
+	if (!guard->meeting)
+		files_ends_mend_own(generation->ends, generation->image, generation->images,
+				    restore->config);
+	init_channel_working(&guard->channel);
+	(void)last_pid_lock(guard->channel.numbers_fd, true);
+	guard->helper = NULL; /* restore_app() ends it */
+	stand_in_begin(&guard->dirty, generation, guard->timer);
+	result = restore_app(restore, err);
+	last_pid_unlock(guard->channel.numbers_fd);
+	*whole = stand_in_finish(&guard->dirty, generation, guard->timer);
+	return result;
+}
+
+/* The newest could not be restored.  Perhaps because the new process or the spare was killed, or the
+ * spare, or what is left of somebody dead, was one process too many: a template that is still whole
+ * is good for `again`. */
+static void prepare_next_try(struct avc_guard *guard, bool again, const struct avc_error *failed)
+{
+	struct generation *generation = &guard->generations[guard->count - 1];
+
+	guard_release_oldest_remains(guard, 0);
+	reap_tracees(guard); /* or because one of them still has the PID, or its group */
+	if (again) {
+		generation->spare.unwanted = generation->spare.pid && failed->errnum == EAGAIN;
+		spare_drop(generation);
+	} else {
+		guard_drop_generation(guard, guard->count - 1);
+		guard_leave_meeting(guard);
+	}
+	guard_kill_lost(guard);
+}
+
+static struct avc_event restored_event(const struct avc_guard *guard,
+				       const struct avc_report *report, enum avc_reason reason)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_RESTORED);
-	bool ending = guard->count < had, again = false, back = false, whole;
-	const bool together = guard->meeting != NULL;
-	struct avc_config config = guard->config;
 
-	if (is_command(reason) || !policy_on_probation(&guard->policy, &config, now_ns()))
-		config.again = AVC_AGAIN_SAME;
 	event.ticket = guard->restore_ticket;
 	event.reason = reason;
 	event.wait_status = report->status;
@@ -264,6 +303,19 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 	/* note_restore() counts this one, too, but none on command. */
 	event.attempt = policy_restores_within(&guard->policy, &guard->config, now_ns()) +
 			!is_command(reason);
+	return event;
+}
+
+bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
+		      enum avc_reason reason, uint32_t had, struct avc_error *error)
+{
+	struct avc_event event = restored_event(guard, report, reason);
+	bool ending = guard->count < had, again = false, back = false, whole;
+	const bool together = guard->meeting != NULL;
+	struct avc_config config = guard->config;
+
+	if (is_command(reason) || !policy_on_probation(&guard->policy, &config, now_ns()))
+		config.again = AVC_AGAIN_SAME;
 	if (together)
 		ready_helper(guard); /* the newest may have changed since the death */
 	/* In a group only this one: an older one belongs to another line. */
@@ -297,22 +349,7 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 			guard_drop_all(guard);
 			break;
 		}
-		release_new(guard, generation);
-		/* Nor may templates lost by this death keep anything open.  And where processes are
-		 * limited, they count, as spares do. */
-		if (ending)
-			guard_wait_ended(guard);
-		if (!together)
-			files_ends_mend_own(generation->ends, generation->image, generation->images,
-					    &config);
-		init_channel_working(&guard->channel);
-		(void)last_pid_lock(guard->channel.numbers_fd, true);
-		guard->helper = NULL; /* restore_app() ends it */
-		stand_in_begin(&guard->dirty, generation, guard->timer);
-		back = restore_app(&restore, &failed) == 0;
-		last_pid_unlock(guard->channel.numbers_fd);
-		whole = stand_in_finish(&guard->dirty, generation, guard->timer);
-		if (back) {
+		if (restore_newest(guard, &restore, ending, &whole, &failed) == 0) {
 			adopt_family(guard, generation);
 			generation->spare.tried = false; /* the spare is used up */
 			note_restore(guard, reason);
@@ -321,6 +358,7 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 			if (!whole)
 				guard_lose_generation(guard, guard->count - 1, AVC_REASON_KILLED,
 						      0);
+			back = true;
 			break;
 		}
 		if (!guard_may_meet(guard)) {
@@ -329,24 +367,11 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 			guard_kill_lost(guard);
 			break;
 		}
-		/* Perhaps because the new process or the spare was killed, or the spare, or what is
-		 * left of somebody dead, was one process too many.  The template is still good. */
-		guard_release_oldest_remains(guard, 0);
-		reap_tracees(guard); /* or because one of them still has the PID, or its group */
-		if (whole && !again) {
-			generation->spare.unwanted = generation->spare.pid &&
-						     failed.errnum == EAGAIN;
-			spare_drop(generation);
-			again = true;
-		} else {
-			if (!error->code)
-				*error = failed;
-			guard_drop_generation(guard, guard->count - 1);
-			again = false;
-			guard_leave_meeting(guard);
-		}
+		again = whole && !again;
+		if (!again && !error->code)
+			*error = failed;
+		prepare_next_try(guard, again, &failed);
 		ending = true;
-		guard_kill_lost(guard);
 	}
 	keep_remains(guard);
 	if (together)
@@ -413,17 +438,12 @@ void guard_app_dies(struct avc_guard *guard)
 	rt_priority_end();
 }
 
-void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
+/* Tells it, and keeps what was asked for of the dead process. */
+static void begin_death(struct avc_guard *guard, const struct avc_report *report,
+			enum avc_reason reason)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_DIED);
-	const uint32_t had = guard->count;
-	const struct policy_verdict verdict = policy_judge(&guard->config, report->status,
-							   report->flags & AVC_REPORT_STOP_ASKED,
-							   guard->restore_asked);
-	const enum avc_reason reason = verdict.reason;
-	struct avc_error error = { 0 };
 
-	rt_priority_begin();
 	guard->channel.death = report->seq;
 	guard->channel.working_ns = now_ns();
 	event.wait_status = report->status;
@@ -438,21 +458,47 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 	guard_emit(guard, &event);
 	process_close(&guard->main);
 	guard_kill_lost(guard);
-	if (!verdict.restore) {
-		guard_give_up(guard, report, reason, &error);
-		goto out;
-	}
-	if (!is_command(reason) && guard->count) {
-		const enum avc_reason over = guard_fall_back(guard, report->status,
-							     reason == AVC_REASON_UNHEALTHY);
+}
 
-		if (!guard->count) {
-			fail(&error, AVC_EMPTY, 0, 0, "restore", "",
-			     "it was restored %u time(s) already", guard->restores);
-			guard_give_up(guard, report, over, &error);
-			goto out;
-		}
-	}
+static void end_death(struct avc_guard *guard)
+{
+	restore_patience_end();
+	if (!guard->dead.waits)
+		drop_helper(guard); /* if there was nothing to restore, after all */
+	guard->foreseen = 0;
+	rt_priority_end();
+	guard_end_recall(guard);
+	guard_leave_meeting(guard);
+	guard->restore_asked = AVC_REASON_NONE;
+	guard->restore_ticket = 0;
+	guard->restore_generation = 0;
+	guard->late_ns = 0;
+}
+
+/* False: it has been restored as often as it may be, and is given up. */
+static bool fall_back(struct avc_guard *guard, const struct avc_report *report,
+		      enum avc_reason reason)
+{
+	struct avc_error error = { 0 };
+	enum avc_reason over;
+
+	if (is_command(reason) || !guard->count)
+		return true;
+	over = guard_fall_back(guard, report->status, reason == AVC_REASON_UNHEALTHY);
+	if (guard->count)
+		return true;
+	fail(&error, AVC_EMPTY, 0, 0, "restore", "", "it was restored %u time(s) already",
+	     guard->restores);
+	guard_give_up(guard, report, over, &error);
+	return false;
+}
+
+/* `had`: how many generations there were at the death. */
+static void restore_dead(struct avc_guard *guard, const struct avc_report *report,
+			 enum avc_reason reason, uint32_t had)
+{
+	struct avc_error error = { 0 };
+
 	if (reason == AVC_REASON_COMMAND && guard->restore_generation)
 		guard_drop_newer(guard, guard->restore_generation);
 	guard_begin_patience(guard);
@@ -474,16 +520,21 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 			guard_hold_all(guard);
 		guard_pace_restored(guard);
 	}
-out:
-	restore_patience_end();
-	if (!guard->dead.waits)
-		drop_helper(guard); /* if there was nothing to restore, after all */
-	guard->foreseen = 0;
-	rt_priority_end();
-	guard_end_recall(guard);
-	guard_leave_meeting(guard);
-	guard->restore_asked = AVC_REASON_NONE;
-	guard->restore_ticket = 0;
-	guard->restore_generation = 0;
-	guard->late_ns = 0;
+}
+
+void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
+{
+	const uint32_t had = guard->count;
+	const struct policy_verdict verdict = policy_judge(&guard->config, report->status,
+							   report->flags & AVC_REPORT_STOP_ASKED,
+							   guard->restore_asked);
+	struct avc_error none = { 0 };
+
+	rt_priority_begin();
+	begin_death(guard, report, verdict.reason);
+	if (!verdict.restore)
+		guard_give_up(guard, report, verdict.reason, &none);
+	else if (fall_back(guard, report, verdict.reason))
+		restore_dead(guard, report, verdict.reason, had);
+	end_death(guard);
 }
