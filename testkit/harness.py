@@ -11,9 +11,11 @@ import fcntl
 import itertools
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,17 +32,22 @@ from testkit.procfs import started
 ROOT = Path(__file__).resolve().parent.parent
 BASE_IMAGE = "localhost/avckpt-base:latest"
 SIDECAR_IMAGE = "localhost/avckpt-sidecar:latest"
-SIDECAR_NAME = "avckpt-sidecar"
+
+LANE = os.environ.get("AVCKPT_LANE", "")
+"""Of a run of tests beside others: hooks and a sidecar of its own, where others have those of this machine."""
+
+SIDECAR_NAME = f"avckpt-sidecar-{LANE}" if LANE else "avckpt-sidecar"
 OURS = "io.github.avckpt.test"
 """Label of every container made here, so that an aborted run's leftovers can be told from a user's containers."""
 
 DROP_IN = Path("/etc/containers/containers.conf.d/50-avckpt.conf")
-RUN_DIR = Path(os.environ.get("AVCKPT_RUN_DIR") or "/run/avckpt")
-CONFIG_DIR = Path("/etc/avckpt")
+MACHINE_CONF = DROP_IN.with_name("10-avckpt-machine.conf")
+RUN_DIR = Path(f"/run/{SIDECAR_NAME}" if LANE else os.environ.get("AVCKPT_RUN_DIR") or "/run/avckpt")
+CONFIG_DIR = Path(f"/run/{SIDECAR_NAME}-etc" if LANE else "/etc/avckpt")
 CONFIG = CONFIG_DIR / "config.yaml"
 OF_A_TEST = "# of a test: what a killed run has left is removed by the next\n"
 """First line of each that a test writes."""
-LOCK = Path("/run/lock/avckpt-tests.lock")
+LOCK = Path(f"/run/lock/avckpt-tests{LANE}.lock")
 
 SLOWNESS = float(os.environ.get("AVCKPT_SLOWNESS", "1"))
 """How many times slower than a machine this one is: an emulated one is (test-machine.sh). Victims look at it, too."""
@@ -489,6 +496,10 @@ def machine_lock(timeout_s: float) -> Iterator[None]:
 @contextlib.contextmanager
 def hooks_installed() -> Iterator[None]:
     """Installs the hooks of this tree; removes them afterwards unless there were some before."""
+    if LANE:
+        with _hooks_of_lane():
+            yield
+        return
     before = DROP_IN.exists()
     run([*avckpt_command(), "install"])
     try:
@@ -496,6 +507,28 @@ def hooks_installed() -> Iterator[None]:
     finally:
         if not before:
             run([*avckpt_command(), "uninstall"], shielded=True)
+
+
+@contextlib.contextmanager
+def _hooks_of_lane() -> Iterator[None]:
+    """The environment of what is started meanwhile: this lane's sidecar, and Podman with its hooks.
+
+    In its configuration, not as an option: conmon, which restarts containers, passes no options on.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        hooks, conf = Path(folder, "hooks.d"), Path(folder, "containers.conf")
+        write_hooks(hooks, RUN_DIR)
+        # Podman reads no other one then (setup-podman.sh).
+        limits = MACHINE_CONF.read_text() if MACHINE_CONF.exists() else ""
+        conf.write_text(f"{limits}[engine]\nhooks_dir = {json.dumps([str(hooks)])}\n")
+        ours = {"AVCKPT_RUN_DIR": str(RUN_DIR), "AVCKPT_CONFIG": str(CONFIG), "CONTAINERS_CONF": str(conf)}
+        os.environ.update(ours)
+        try:
+            yield
+        finally:
+            for name in ours:
+                del os.environ[name]
+            shutil.rmtree(RUN_DIR, ignore_errors=True)
 
 
 @contextlib.contextmanager
