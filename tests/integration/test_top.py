@@ -104,7 +104,7 @@ def test_a_sidecar_that_goes_and_comes(local: LocalSidecar) -> None:
 def test_only_what_has_changed_is_painted(local: LocalSidecar, monkeypatch: pytest.MonkeyPatch) -> None:
     unit = local.protected("lidar", SLEEPER, ON_COMMAND)
     take_checkpoint(local.client, "lidar")
-    local.wait_for(unit, state="protected", generations=1)
+    local.wait_for(unit, state="protected")  # by one checkpoint, or by two if the first was missed
     looks, painted = 0, []
     show, update_cell = Top._show, DataTable.update_cell
 
@@ -121,13 +121,14 @@ def test_only_what_has_changed_is_painted(local: LocalSidecar, monkeypatch: pyte
     monkeypatch.setattr(DataTable, "update_cell", paint)
 
     async def steps(app: Top, pilot: Pilot[None]) -> None:
-        await until(pilot, lambda: cells(app, "FREEZES") == ["█"], "the unit, and its events")
+        await until(pilot, lambda: "█" in "".join(cells(app, "FREEZES")), "the unit, and its events")
+        freezes = len(cells(app, "FREEZES")[0])
         painted.clear()
         before = looks
         await until(pilot, lambda: looks > before + 2, "it has looked again")
         assert set(painted) == {"CHECKPOINT"}  # its age
         await asyncio.to_thread(take_checkpoint, local.client, "lidar")
-        await until(pilot, lambda: cells(app, "GENS") == ["2/2"], "the next one")
+        await until(pilot, lambda: len(cells(app, "FREEZES")[0]) == freezes + 1, "the next one")
         assert "UNIT" not in painted
 
     driven(local, steps)
