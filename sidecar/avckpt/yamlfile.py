@@ -54,6 +54,10 @@ class _Loader(yaml.SafeLoader):
             raise RecursionError
 
 
+_PIPES: dict[Path, bytes] = {}
+"""What came out of each (/dev/stdin, <(...) of a shell): nothing does a second time."""
+
+
 def read(path: Path) -> yaml.Node | None:
     """The root of the only document in `path`; None: the file is empty.  Raises Unreadable."""
     documents = read_all(path, several=False)
@@ -67,7 +71,7 @@ def read_all(path: Path, *, several: bool = True) -> list[yaml.Node]:
     `VALUES_MOST`.
     """
     try:
-        text = read_bounded(str(path), FILE_BYTES).decode()
+        text = _content(path).decode()
     except TooLong as error:
         raise Unreadable(Place(str(path), 0), f"longer than {FILE_BYTES} bytes") from error
     except OSError as error:
@@ -92,6 +96,15 @@ def read_all(path: Path, *, several: bool = True) -> list[yaml.Node]:
         raise Unreadable(Place(str(path), 1), f"not YAML: {error}") from error
     except RecursionError as error:
         raise Unreadable(Place(str(path), 1), "nested too deeply") from error
+
+
+def _content(path: Path) -> bytes:
+    if path in _PIPES:
+        return _PIPES[path]
+    content = read_bounded(str(path), FILE_BYTES)
+    if path.is_fifo():
+        _PIPES[path] = content
+    return content
 
 
 def _expanded(node: yaml.Node | None, path: Path, known: dict[int, int]) -> int:

@@ -82,3 +82,15 @@ def test_a_chain_of_services_is_followed_so_far(tmp_path: Path) -> None:
     path.write_text("services:\n" + "".join(f"  w{n}: {extends.format(n=n)}\n" for n in range(2000)))
     said = check(path)
     assert "extends more than 50 services, one by way of the other" in said
+
+
+def test_a_pipe_is_read_once() -> None:
+    """Compose, or Kubernetes: that takes a look of its own."""
+    done = subprocess.run(
+        [sys.executable, "-m", "avckpt", "check", "/dev/stdin"],
+        input="services: {web: {image: x, labels: [avckpt.keep=many]}}\n",
+        capture_output=True,
+        text=True,
+    )
+    assert "keep" in done.stdout
+    assert done.returncode == 1
