@@ -93,9 +93,10 @@ def test_memory_held_is_shown(
     victim.checkpoint()
     assert held(sidecar, victim.container)["memory_bytes"] < 5 * MB
     write_hoard(victim, signal.SIGUSR1, held_mb)
-    assert held_mb * MB <= held(sidecar, victim.container)["memory_bytes"] < (held_mb + 5) * MB
+    # A page that somebody else has for a moment counts as half a page.
+    assert (held_mb - 1) * MB < held(sidecar, victim.container)["memory_bytes"] < (held_mb + 5) * MB
     victim.checkpoint()
     # Shared by both generations and no longer by the application: counted once.
     victim.checkpoint()
     write_hoard(victim, signal.SIGUSR1, held_mb)
-    assert held_mb * MB <= held(sidecar, victim.container)["memory_bytes"] < (held_mb + 10) * MB
+    assert (held_mb - 1) * MB < held(sidecar, victim.container)["memory_bytes"] < (held_mb + 10) * MB
