@@ -148,4 +148,6 @@ def test_workers_share_their_memory_after_a_restore(
     before = sum(figures(member.pid)["Pss"] for member in tree.members())
     tree.kill()
     after = sum(figures(member.pid)["Pss"] for member in tree.members())
-    assert after < 1.3 * before + 8192, (before, after)
+    # The templates that share it before, and may be gone after, make a copy's difference; four workers with
+    # copies of their own would make three more.
+    assert after < before + 2 * 25 * 1024, (before, after)
