@@ -33,6 +33,9 @@ fill() {
 		--platform "linux_$machine" "$BUILD"/wheel/avckpt-*.whl || return
 	rm -rf "${site:?}/bin" "${site:?}/share" || return
 	find "$site" -name __pycache__ -prune -exec rm -rf {} + || return
+	# Where pip found the wheel is nobody's business.
+	rm -f "$site"/avckpt-*.dist-info/direct_url.json || return
+	sed -i '/direct_url\.json/d' "$site"/avckpt-*.dist-info/RECORD || return
 	/usr/bin/python3 -m compileall -q --invalidation-mode unchecked-hash -s "$stage" "$site"
 }
 

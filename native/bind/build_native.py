@@ -53,7 +53,7 @@ ffibuilder.set_source(
     include_dirs=[relative(NATIVE / "include")],
     extra_objects=[relative(NATIVE / "build" / "libavckpt-client.a")],
     depends=[relative(NATIVE / "build" / "libavckpt-client.a")],
-    extra_compile_args=["-std=gnu11", "-O2"],
+    extra_compile_args=["-std=gnu11", "-O2", f"-ffile-prefix-map={NATIVE.parent}=."],
     libraries=["pthread"],
 )
 

@@ -84,6 +84,11 @@ def test_the_sidecar_is_built_and_started(site: Path, podman: Podman, base_image
         installed(site, "uninstall")
 
 
+def test_it_is_the_same_wherever_it_was_built(site: Path) -> None:
+    told = {path.name for path in site.rglob("*") if path.is_file() and bytes(ROOT) in path.read_bytes()}
+    assert told <= {"avckpt"}  # which pip makes: its first line names this Python
+
+
 @long
 def test_the_deb_comes_and_goes(podman: Podman, base_image: str) -> None:
     subprocess.run([ROOT / "scripts/make-deb.sh"], check=True)
