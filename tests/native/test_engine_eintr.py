@@ -128,10 +128,13 @@ def test_threads_wait_for_a_slow_guard_while_they_are_restored(tmp_path: Path) -
         assert guard.checkpoint()["kind"] == "checkpoint"
         command = ["strace", "-f", "-qq", "-o", "/dev/null", "-e", "trace=ptrace", "-e", delay, "-p", str(guard.pid)]
         with subprocess.Popen(command) as strace:
-            wait_until(lambda: status_of(guard.pid)["TracerPid"] == str(strace.pid), 10 * SLOWNESS, "strace traces it")
-            victim.kill_app()
-            guard.wait("restored")
-            strace.send_signal(signal.SIGINT)
+            traced = str(strace.pid)
+            try:
+                wait_until(lambda: status_of(guard.pid)["TracerPid"] == traced, 10 * SLOWNESS, "strace traces it")
+                victim.kill_app()
+                guard.wait("restored")
+            finally:
+                strace.send_signal(signal.SIGINT)
         victim.wait_beats()
 
 
