@@ -561,8 +561,6 @@ static bool hear(struct avc_guard *guard, bool news)
 		return true;
 	if (news)
 		carry_out(guard);
-	if (guard->dead.waits)
-		guard_tend_dead(guard);
 	return false;
 }
 
@@ -617,7 +615,11 @@ static void guard_main(struct avc_guard *guard)
 			continue;
 		}
 		ended = hear(guard, news);
-		if (ended || (!guard->dead.waits && seccomp_must_suspend()))
+		if (ended)
+			break;
+		if (guard->dead.waits)
+			guard_tend_dead(guard);
+		else if (seccomp_must_suspend())
 			break;
 		work(guard);
 	}
