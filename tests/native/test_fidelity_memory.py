@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from avckpt.policy import settings_of
 
 from testkit.guarded import WHERE, GuardProcess, Json, Victim, config, kill_at_random
 from testkit.harness import wait_until
@@ -153,21 +154,24 @@ def test_more_shared_memory_than_allowed_is_left_alone_and_told(tmp_path: Path) 
         GuardProcess(config(0.05), [plain.pid, victim.pid]) as guard,
     ):
         told = guard.wait("checkpoint", cookie=2)["error"]["message"]
-        assert "65536 kB of shared memory are more than avckpt.shm allows" in told
+        assert "avckpt.shm has no room for 65536 KiB of shared memory" in told
         assert not guard.wait("checkpoint", cookie=1).get("error")
 
 
-@pytest.mark.parametrize("kind", ["--inherited", "--segment", "--memfd"])
+@pytest.mark.parametrize("kind", ["--inherited", "--segment", "--memfd", "--memfd --twice", "--inherited --twice"])
 def test_more_shared_memory_than_allowed_that_nobody_else_has(kind: str, tmp_path: Path) -> None:
     """Refused: it is the process's own state, as the heap of Java's ZGC, which crashed after each restore."""
     with Victim(f"mappings 8000 {kind}", tmp_path) as victim:
         with GuardProcess(config(), [victim.pid]) as guard:
             answer = guard.checkpoint()
             assert answer["kind"] == "unprotected", answer
-            assert "8000 kB of shared memory that nobody else has" in answer["error"]["message"]
+            assert "no room for 8000 KiB of shared memory that nobody else has" in answer["error"]["message"]
         with GuardProcess(config(shm_bytes=0), [victim.pid]) as guard:  # its user takes it for no state
-            assert "8000 kB of shared memory are more" in guard.checkpoint()["error"]["message"]
-        with GuardProcess(config(0.1, shm_bytes=8_192_000), [victim.pid]) as guard:
+            assert "no room for 8000 KiB of shared memory" in guard.checkpoint()["error"]["message"]
+        with GuardProcess(
+            config(0.1, shm_bytes=settings_of({"avckpt.enable": "true", "avckpt.shm": "8000 KiB"}).config.shm_bytes),
+            [victim.pid],
+        ) as guard:
             kill_at_random(guard, victim, 5, (0.01, 0.3))
 
 
@@ -178,14 +182,14 @@ def test_more_shared_memory_than_allowed_of_several_processes(megabytes: int, ki
         answer = guard.checkpoint()
         assert answer["kind"] == kind, answer
         if kind == "unprotected":
-            assert "8192 kB" in answer["error"]["message"]
-            assert "several of its processes share memory" in answer["error"]["message"]
+            assert "8192 KiB" in answer["error"]["message"]
+            assert "several of its processes share" in answer["error"]["message"]
         victim.wait_beats()
 
 
 def test_small_shared_memory_is_rolled_back_beside_a_large_one(tmp_path: Path) -> None:
     with large(tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
-        assert "65536 kB of shared memory" in guard.wait("checkpoint")["error"]["message"]
+        assert "65536 KiB of shared memory" in guard.wait("checkpoint")["error"]["message"]
         kill_at_random(guard, victim, 10, (0.01, 0.15))
 
 

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
  * mappings [SHARED_KB] [--inherited] [--huge] [--segment] [--memfd] [--future] [--large]
- * [--unbound]: memory of every kind a plain fork does not carry as it is, and kinds that are easily
+ * [--unbound] [--twice]: memory of every kind a plain fork does not carry as it is, and kinds that are easily
  * forgotten.  Each is written and read all the time.
  *
  * - anonymous, MADV_DONTFORK: not in a fork at all (V8 marks its heap so)
@@ -19,7 +19,8 @@
  * With --inherited the first two are ordinary memory; with --huge the shared memory is of huge pages,
  * with --segment System V's, with --memfd a memfd's; with --large there are 64 MB more of shared memory
  * that others can find in /dev/shm, of which nothing is expected; with --future all memory that comes
- * is locked (mlockall); with --unbound no area has a policy.
+ * is locked (mlockall); with --unbound no area has a policy; with --twice the shared memory is mapped a
+ * second time, to be read, as just-in-time compilers map code.
  */
 #include <linux/mempolicy.h>
 #include <setjmp.h>
@@ -72,6 +73,16 @@ static void *map_file(int fd, size_t bytes)
 	must(at != MAP_FAILED, "mmap");
 	close(fd);
 	return at;
+}
+
+/* Of a length of 0, mremap(2) maps shared memory once more. */
+static struct region see_again(const struct region *region)
+{
+	const size_t bytes = region->words * sizeof *region->at;
+	void *at = mremap(region->at, 0, bytes, MREMAP_MAYMOVE);
+
+	must(at != MAP_FAILED && !mprotect(at, bytes, PROT_READ), "mremap");
+	return (struct region){ "shared memory, seen again", at, region->words };
 }
 
 static int make_file(void)
@@ -185,11 +196,11 @@ static void check_bound(void)
 int main(int argc, char **argv)
 {
 	struct sigaction act = { .sa_handler = on_fault };
-	struct region regions[8];
+	struct region regions[8], view = { 0 };
 	size_t shared_kb, lap;
 	uint64_t *read_only, *none, *heap;
 	char *brk_at;
-	bool inherited, huge, segment, memfd, large, unbound;
+	bool inherited, huge, segment, memfd, large, unbound, twice;
 	int n = 0, fd;
 
 	inherited = victim_flag(&argc, argv, "--inherited");
@@ -199,10 +210,11 @@ int main(int argc, char **argv)
 	memfd = victim_flag(&argc, argv, "--memfd");
 	large = victim_flag(&argc, argv, "--large");
 	unbound = victim_flag(&argc, argv, "--unbound");
+	twice = victim_flag(&argc, argv, "--twice");
 	victim_start(
 		&argc, argv, 0,
 		"[SHARED_KB] [--inherited] [--huge] [--segment] [--memfd] [--future] [--large] "
-		"[--unbound]");
+		"[--unbound] [--twice]");
 	shared_kb = argc > 1 ? (size_t)atol(argv[1]) : 64;
 	sigaction(SIGSEGV, &act, NULL);
 
@@ -238,6 +250,8 @@ int main(int argc, char **argv)
 
 		must(at != MAP_FAILED, "mmap");
 		regions[n++] = (struct region){ "shared memory", at, (shared_kb << 10) / 8 };
+		if (twice)
+			view = see_again(&regions[n - 1]);
 	}
 	/* Below the other, so that it is found first. */
 	if (large)
@@ -252,6 +266,7 @@ int main(int argc, char **argv)
 	victim_ready();
 	for (lap = 0;; lap++) {
 		check_all(regions, n);
+		check_all(&view, twice);
 		version++;
 		write_all(regions, n);
 		check_fault(none, false, "PROT_NONE memory");

@@ -157,25 +157,40 @@ void mem_seen_free(struct mem_seen *seen)
 	*seen = (struct mem_seen){ 0 };
 }
 
+static struct mem_key key_of(const struct area *a)
+{
+	return (struct mem_key){ a->device, a->inode, a->offset, area_bytes(a) };
+}
+
+bool mem_seen_has(const struct mem_seen *seen, const struct area *a)
+{
+	const struct mem_key key = key_of(a);
+
+	return seen->room && find_key(seen, &key)->bytes;
+}
+
+bool mem_seen_add(struct mem_seen *seen, const struct area *a)
+{
+	const struct mem_key key = key_of(a);
+
+	if (!make_seen_room(seen))
+		return false;
+	*find_key(seen, &key) = key;
+	seen->count++;
+	seen->shared_bytes += key.bytes;
+	return true;
+}
+
 /* Whether an image gets its contents: once for all processes, and within the limit. */
 static int see(struct mem_seen *seen, struct area *a, uint64_t limit, struct avc_error *err)
 {
-	const struct mem_key key = { a->device, a->inode, a->offset, area_bytes(a) };
-	struct mem_key *k;
-
 	a->again = a->left = false;
 	if (a->wiped)
 		return 0;
-	if (!make_seen_room(seen))
+	a->again = mem_seen_has(seen, a);
+	a->left = !a->again && seen->shared_bytes + area_bytes(a) > limit;
+	if (!a->again && !a->left && !mem_seen_add(seen, a))
 		return fail_errno(err, 0, "keep memory", "calloc", "out of memory");
-	k = find_key(seen, &key);
-	a->again = k->bytes != 0;
-	a->left = !a->again && seen->shared_bytes + key.bytes > limit;
-	if (a->again || a->left)
-		return 0;
-	*k = key;
-	seen->count++;
-	seen->shared_bytes += key.bytes;
 	return 0;
 }
 
@@ -512,7 +527,7 @@ int memory_finish(struct image *image, int64_t locked_kb, struct setup *setup,
 			->flags = INJ_MAY_FAIL;
 	if (process->memory->others_bytes && !setup->notice.code)
 		fail(&setup->notice, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
-		     "%llu kB of shared memory are also others', outside of the container, and are not rolled back",
+		     "%llu KiB of shared memory are also others', outside of the container, and are not rolled back",
 		     (unsigned long long)process->memory->others_bytes / 1024);
 	return 0;
 }
@@ -527,7 +542,7 @@ void memory_note_left(const struct image *image, uint32_t images, struct avc_err
 				      image[i].memory->left_bytes;
 	if (left_bytes)
 		fail(notice, AVC_UNSUPPORTED, 0, image->process->pid, "keep memory", "",
-		     "%llu kB of shared memory are more than avckpt.shm allows, and are not rolled back",
+		     "avckpt.shm has no room for %llu KiB of shared memory, which are not rolled back",
 		     (unsigned long long)left_bytes / 1024);
 }
 
@@ -551,7 +566,7 @@ static int note_unless_equal(const struct area *a, int mem_fd, const uint8_t *fr
 {
 	if (!is_equal(mem_fd, a, from))
 		fail(notes, AVC_UNSUPPORTED, EPERM, 0, "restore", "write",
-		     "%zu kB of shared memory have been sealed or cut since, and are not rolled back",
+		     "%zu KiB of shared memory have been sealed or cut since, and are not rolled back",
 		     area_bytes(a) / 1024);
 	return 0;
 }
@@ -605,7 +620,7 @@ static int put_back(const struct putting *putting, struct area *a, const uint8_t
 
 	if (a->as_file && mem_others_writes(others, a) != a->writes) {
 		fail(putting->notes, AVC_UNSUPPORTED, 0, putting->pid, "restore", "",
-		     "%zu kB of shared memory have been written as files since, and are not rolled back",
+		     "%zu KiB of shared memory have been written as files since, and are not rolled back",
 		     area_bytes(a) / 1024);
 		return 0;
 	}

@@ -29,7 +29,7 @@ struct area {
 	bool as_file;       /* ... or open by that name                                */
 	bool linked;        /* which it had at the checkpoint                          */
 	bool found;         /* others can find it later: by a name in /dev/shm, or a System V key */
-	bool again;         /* another process of the app has it, too, and its image keeps it */
+	bool again;         /* another area of the app is of the same memory, and kept       */
 	bool left;          /* no room for it */
 	uint8_t protection; /* as mmap(2) has it                                     */
 	enum area_way way;
@@ -125,6 +125,12 @@ static inline size_t area_bytes(const struct area *a)
 {
 	return a->end - a->start;
 }
+
+/* ---- memory.c ---------------------------------------------------------------- */
+
+bool mem_seen_has(const struct mem_seen *seen, const struct area *area);
+/* One that it has not; false: out of memory. */
+bool mem_seen_add(struct mem_seen *seen, const struct area *area);
 
 /* ---- memory_areas.c ---------------------------------------------------------- */
 

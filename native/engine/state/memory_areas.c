@@ -45,8 +45,8 @@ struct survey {
 	pid_t template;
 	struct memory *memory;
 	struct areas areas, foreign, unkept;
-	uint64_t layout, shared_bytes, since;
-	uint64_t left_bytes, others_bytes;
+	struct mem_seen kept, left; /* the same memory may be mapped more than once           */
+	uint64_t layout, since, others_bytes;
 	const char *refused;
 	bool too_many, lost_some, unforked;
 	bool recycled; /* image.recycled                                             */
@@ -303,6 +303,18 @@ static enum area_way way_of(pid_t template, const struct area *a)
 	return area_find_descriptor(template, a) >= 0 ? WAY_FILE : WAY_NONE;
 }
 
+/* A second mapping of the same memory takes none: code that a just-in-time compiler writes through one
+ * and executes through the other, the heap of ZGC. */
+static bool has_room(struct survey *survey, const struct area *a)
+{
+	if (mem_seen_has(&survey->kept, a))
+		return true;
+	if (survey->kept.shared_bytes + area_bytes(a) > survey->process->shm_bytes)
+		return false;
+	survey->lost_some |= !mem_seen_add(&survey->kept, a);
+	return true;
+}
+
 /* One that is too large does not prevent small ones from being rolled back. */
 static bool is_to_be_kept(struct survey *survey, struct area *a)
 {
@@ -315,13 +327,12 @@ static bool is_to_be_kept(struct survey *survey, struct area *a)
 		return false;
 	}
 	a->way = way_of(survey->template, a);
-	if (a->way == WAY_NONE ||
-	    survey->shared_bytes + area_bytes(a) > survey->process->shm_bytes) {
-		survey->left_bytes += a->way == WAY_NONE ? 0 : area_bytes(a);
+	if (a->way == WAY_NONE || !has_room(survey, a)) {
+		if (a->way != WAY_NONE && !mem_seen_has(&survey->left, a))
+			survey->lost_some |= !mem_seen_add(&survey->left, a);
 		survey->lost_some |= !add_area(&survey->unkept, a);
 		return false;
 	}
-	survey->shared_bytes += area_bytes(a);
 	if (a->as_file)
 		mem_others_watch(survey->process->others, survey->template, a);
 	return true;
@@ -384,7 +395,7 @@ static int read_areas(struct survey *survey, const struct areas *copied, struct 
 	sort_out(survey);
 	memory->read_ns = now_ns();
 	memory->cost_ns = memory->read_ns - start;
-	memory->left_bytes = survey->left_bytes;
+	memory->left_bytes = survey->left.shared_bytes;
 	memory->others_bytes = survey->others_bytes;
 	areas_free(&memory->foreign);
 	memory->foreign = survey->foreign;
@@ -440,6 +451,8 @@ static int check_layout(const struct image *image, struct avc_error *err)
 	areas_free(&survey.areas);
 	areas_free(&survey.foreign);
 	areas_free(&survey.unkept);
+	mem_seen_free(&survey.kept);
+	mem_seen_free(&survey.left);
 	leases_free(&survey.leases);
 	mounts_free(&survey.mounts);
 	return result;
@@ -448,7 +461,7 @@ static int check_layout(const struct image *image, struct avc_error *err)
 /* ---- what several processes have ------------------------------------------------------------ */
 
 struct unkept {
-	uint64_t device, inode, bytes;
+	uint64_t device, inode, offset, bytes;
 	pid_t pid;
 	bool written, found;
 };
@@ -474,6 +487,7 @@ static bool add_unkept(struct unkept_list *list, const struct process *process,
 			list->item[list->count++] = (struct unkept){
 				.device = a->device,
 				.inode = a->inode,
+				.offset = a->offset,
 				.bytes = area_bytes(a),
 				.pid = process->pid,
 				.written = a->way != WAY_NONE,
@@ -484,13 +498,25 @@ static bool add_unkept(struct unkept_list *list, const struct process *process,
 	return true;
 }
 
+/* Mappings of the same memory are neighbours then, those that can be written first. */
 static int compare_unkept(const void *a, const void *b)
 {
 	const struct unkept *x = a, *y = b;
 
 	if (x->device != y->device)
 		return x->device < y->device ? -1 : 1;
-	return (x->inode > y->inode) - (x->inode < y->inode);
+	if (x->inode != y->inode)
+		return x->inode < y->inode ? -1 : 1;
+	if (x->offset != y->offset)
+		return x->offset < y->offset ? -1 : 1;
+	if (x->bytes != y->bytes)
+		return x->bytes < y->bytes ? -1 : 1;
+	return y->written - x->written;
+}
+
+static bool same_unkept(const struct unkept *a, const struct unkept *b)
+{
+	return a->inode == b->inode && a->device == b->device;
 }
 
 /* The first one that several processes have and at least one can write; NULL: none. */
@@ -502,7 +528,7 @@ static const struct unkept *find_common(const struct unkept_list *list)
 	for (uint32_t i = 0; i < list->count; i++) {
 		const struct unkept *u = &list->item[i];
 
-		if (compare_unkept(first, u)) {
+		if (!same_unkept(first, u)) {
 			first = u;
 			several = written = false;
 		}
@@ -521,9 +547,14 @@ static uint64_t own_bytes(const struct unkept_list *list)
 {
 	uint64_t bytes = 0;
 
-	for (uint32_t i = 0; i < list->count; i++)
-		if (list->item[i].written && !list->item[i].found)
-			bytes += list->item[i].bytes;
+	for (uint32_t i = 0; i < list->count; i++) {
+		const struct unkept *u = &list->item[i];
+		const bool again = i && same_unkept(u - 1, u) && u[-1].offset == u->offset &&
+				   u[-1].bytes == u->bytes;
+
+		if (u->written && !u->found && !again)
+			bytes += u->bytes;
+	}
 	return bytes;
 }
 
@@ -544,17 +575,16 @@ int memory_check_unkept(const struct image *image, uint32_t images, struct avc_e
 		qsort(list.item, list.count, sizeof *list.item, compare_unkept);
 		common = find_common(&list);
 		if (common)
-			result =
-				fail(err, AVC_UNSUPPORTED, 0, common->pid, "keep memory", "",
-				     "several of its processes share memory (one area has %llu kB) "
-				     "that is more than avckpt.shm allows",
-				     (unsigned long long)common->bytes / 1024);
+			result = fail(err, AVC_UNSUPPORTED, 0, common->pid, "keep memory", "",
+				      "avckpt.shm has no room for memory that several of its "
+				      "processes share (one area has %llu KiB)",
+				      (unsigned long long)common->bytes / 1024);
 		/* 0: the user wants none to be rolled back. */
 		else if (image->process->shm_bytes && (own = own_bytes(&list)))
 			result = fail(err, AVC_UNSUPPORTED, 0, image->process->pid, "keep memory",
 				      "",
-				      "%llu kB of shared memory that nobody else has are more than "
-				      "avckpt.shm allows",
+				      "avckpt.shm has no room for %llu KiB of shared memory that "
+				      "nobody else has",
 				      (unsigned long long)own / 1024);
 	}
 	free(list.item);
