@@ -16,11 +16,12 @@ from pathlib import Path
 
 import pytest
 from avckpt.cli.client import Client, Json
-from avckpt.cli.top import COLUMNS, Ask, Top, sparkline
+from avckpt.cli.top import COLUMNS, Ask, Top, shortened, sparkline
 from avckpt.guard import Command
 from rich.text import Text
 from textual.pilot import Pilot
 from textual.widgets import DataTable, Label, RichLog
+from textual.widgets._footer import FooterKey
 
 from testkit.harness import avckpt_command, take_checkpoint, wait_until
 from testkit.local_sidecar import ON_COMMAND, LocalSidecar
@@ -159,6 +160,38 @@ def test_what_is_said_fits_the_screen(local: LocalSidecar) -> None:
             await pilot.press("n")
 
     driven(local, steps)
+
+
+@pytest.mark.shared_machine("screens on a busy machine may take longer than the test waits")
+def test_a_long_name_leaves_room_for_the_rest(local: LocalSidecar) -> None:
+    name = f"vehicle-{'x' * 100}-lidar"
+    local.wait_for(local.protected(name, SLEEPER, LABELS), state="protected")
+
+    async def steps(app: Top, pilot: Pilot[None]) -> None:
+        table = app.query_one("#units", DataTable)
+
+        def is_seen() -> bool:
+            before = sum(table.ordered_columns[n].get_render_width(table) for n in range(2))
+            return bool(cells(app, "UNIT")) and before <= table.size.width
+
+        for columns in (160, 80, 40, 120):
+            await pilot.resize_terminal(columns, 20)
+            await until(pilot, is_seen, f"its state in {columns} columns")
+            assert cells(app, "STATE") == ["protected"]
+            (shown,) = cells(app, "UNIT")
+            assert shown.startswith("vehic")
+            assert shown.endswith("idar")
+            leave = next(key for key in app.query(FooterKey) if key.description == "Leave")
+            assert leave.region.right <= columns
+
+    driven(local, steps)
+
+
+@pytest.mark.parametrize(
+    ("name", "length", "shown"), [("lidar", 5, "lidar"), ("a-lidar", 5, "a-…ar"), ("abcdefg", 6, "abc…fg")]
+)
+def test_a_name_is_shortened_in_the_middle(name: str, length: int, shown: str) -> None:
+    assert shortened(name, length) == shown
 
 
 @dataclass

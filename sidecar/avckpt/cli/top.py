@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from avckpt.cli.client import Client, Json
 
 LOOK_S = 1.0
+NAME_LEAST = 10
+"""Columns that a name may always take; on a wide screen it is a third."""
 SPARKS = "▁▂▃▄▅▆▇█"
 KEPT = 12
 """Freezes and restores that a sparkline has."""
@@ -81,6 +83,12 @@ def sparkline(values: Iterable[float]) -> str:
     return "".join(SPARKS[min(int(value / most * len(SPARKS)), len(SPARKS) - 1)] for value in values)
 
 
+def shortened(name: str, length: int) -> str:
+    """Without its middle: where it begins and ends is where names of one machine differ."""
+    begin = length // 2
+    return name if len(name) <= length else f"{name[:begin]}…{name[begin + 1 - length :]}"
+
+
 class Ask(ModalScreen[bool]):
     """A question that y answers; any other key is no."""
 
@@ -123,12 +131,13 @@ class Top(App[None]):
     CSS = "#head { height: 1; } #units { height: 2fr; } #events { height: 1fr; border-top: solid $accent; }"
     ENABLE_COMMAND_PALETTE = False
     BINDINGS: ClassVar[list[BindingType]] = [
+        # A narrow screen shows the first ones, and the others in the help.
+        Binding("q", "quit", "Leave"),
+        Binding("question_mark", "help", "Help"),
         Binding("c", "checkpoint", "Checkpoint"),
         Binding("r", "restore", "Roll back"),
         Binding("e", "events", "Events of one / all"),
         Binding("s", "sort", "Sort"),
-        Binding("question_mark", "help", "Help"),
-        Binding("q", "quit", "Leave"),
         # As in any other program, also while a question is asked; Textual itself only says how to leave.
         Binding("ctrl+c", "quit", show=False, priority=True),
         Binding("ctrl+z", "suspend_process", show=False, priority=True),
@@ -248,7 +257,7 @@ class Top(App[None]):
         age_s = None if row["last_checkpoint_at"] is None else max(0.0, time.time() - row["last_checkpoint_at"])
         restores = " ".join(filter(None, (sparkline(seen.restores_s), _ms(row["last_restore_s"]))))
         return [
-            Text(called(row)),
+            Text(shortened(called(row), max(self.size.width // 3, NAME_LEAST))),
             Text(row["state"], style=STATE_STYLES.get(row["state"], "")),
             Text("-" if row["state"] == "listening" else f"{row['generations']}/{row['keep']}"),
             Text("-" if age_s is None else f"{age_s:.1f} s", justify="right"),
