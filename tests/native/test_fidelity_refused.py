@@ -62,6 +62,7 @@ def built(init_built: None, victims_built: Path) -> None:
         ("unsupported bounds", "lacks CAP_SETPCAP"),
         ("unsupported locked", "which has locked its own"),
         ("unsupported locked-child", "which has locked its own"),
+        ("unsupported rooted-child", "its parent has given up the right to chroot(2)"),
         ("unsupported user", "which has locked its own"),
         ("unsupported dropped", "which has given up the right to be that"),
         ("unsupported vfork", "executes no program (vfork)"),

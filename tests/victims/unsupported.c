@@ -28,6 +28,7 @@
  *   bounds    one thread with a smaller bounding set, which the main thread may not lower
  *   locked, locked-child  one thread, or a child process, without a securebit that the main
  *             thread has locked
+ *   rooted-child  a child with a root directory of its own, whose parent is another user since
  *   unfiltered-child, other-filter   the main process has a seccomp filter that a child process has
  *             not; and the child has another one instead
  *   user      one thread of another user, and the main thread has locked that capabilities are
@@ -477,6 +478,33 @@ static bool start_locked_child(void)
 	return start_child(0) && lock_securebits(SECBIT_NOROOT | SECBIT_NOROOT_LOCKED);
 }
 
+static bool become_another_user(void)
+{
+	return !setgid(1234) && !setuid(1234);
+}
+
+/* As lldpd: both have given up their rights, the child after it has changed its root. */
+static bool start_rooted_child(void)
+{
+	int ready[2];
+	long child;
+	char byte;
+
+	must(!pipe(ready), "pipe");
+	child = syscall(SYS_clone, SIGCHLD, 0, 0, 0, 0);
+	if (!child) {
+		must(!chroot("/tmp") && !chdir("/") && become_another_user(), "chroot");
+		close(ready[0]);
+		close(ready[1]);
+		for (;;)
+			pause();
+	}
+	close(ready[1]);
+	must(read(ready[0], &byte, 1) == 0, "read");
+	close(ready[0]);
+	return child > 0 && become_another_user();
+}
+
 static bool start_filtered_child(void)
 {
 	const pid_t pid = fork();
@@ -700,6 +728,7 @@ static const struct kind {
 	{ "bounds", start_bounds, NULL },
 	{ "locked", start_locked, NULL },
 	{ "locked-child", start_locked_child, NULL },
+	{ "rooted-child", start_rooted_child, NULL },
 	{ "unfiltered-child", start_unfiltered_child, NULL },
 	{ "other-filter", start_other_filter, NULL },
 	{ "user", start_user, NULL },

@@ -4,6 +4,7 @@
  */
 #include <errno.h>
 #include <fcntl.h>
+#include <linux/capability.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -173,6 +174,22 @@ static void note_filters(struct process *process, uint32_t count)
 	process->filters = count;
 }
 
+/* Its parent forks it with its own, and a process enters another one with the rights of its parent. */
+static int check_root(const struct process *process, const struct process *parent,
+		      struct avc_error *err)
+{
+	struct proc_status status;
+
+	if (!parent || proc_same_file(process->pid, parent->pid, "root") != 0 ||
+	    proc_status(parent->pid, &status) ||
+	    status.caps[STATUS_EFFECTIVE] >> CAP_SYS_CHROOT & 1)
+		return 0;
+	return fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "",
+		    "process %d has a root directory of its own, and its parent has given up the "
+		    "right to chroot(2)",
+		    process->inside);
+}
+
 int support_check(struct process *process, const struct process *parent, struct avc_error *err)
 {
 	struct proc_status status;
@@ -186,7 +203,9 @@ int support_check(struct process *process, const struct process *parent, struct 
 	dying_note_caught(process, &status);
 	(void)seccomp_is_containers(&status, process->plain_filters);
 	note_filters(process, status.seccomp_filters);
-	return process->descendant ? check_descendant(process, &status, err) : 0;
+	if (!process->descendant)
+		return 0;
+	return check_descendant(process, &status, err) ? -1 : check_root(process, parent, err);
 }
 
 /* Through the process: a second dentry for each thread in /proc would make its exit slower (see
