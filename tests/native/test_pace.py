@@ -144,3 +144,21 @@ def test_it_runs_for_as_long_as_it_was_stopped(tmp_path: Path) -> None:
     frozen_s = sum(event["freeze_s"] for event in taken[:-1])
     assert frozen_s / len(taken) > 0.001
     assert (taken[-1]["at_ns"] - taken[0]["at_ns"]) / 1e9 > 1.9 * frozen_s
+
+
+def cpu_ticks(pid: int) -> tuple[int, int]:
+    """What it has used, as a user and in the kernel."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return int(fields[11]), int(fields[12])
+
+
+def test_it_is_not_kept_busy_by_copies_of_what_it_writes(tmp_path: Path) -> None:
+    """23,000 pages: the first writes to them take longer than the interval, so there would be nothing else."""
+    often = config(0.05, images=Images.FORK)
+    with Victim("hoard 90 always", tmp_path) as victim, GuardProcess(often, [victim.pid]) as guard:
+        guard.wait("checkpoint", count=4)
+        before = cpu_ticks(victim.app)
+        wait_until(lambda: sum(cpu_ticks(victim.app)) > sum(before) + 150, PATIENCE_S, "it has used 1.5 s")
+        user, kernel = (now - then for now, then in zip(cpu_ticks(victim.app), before))
+        victim.check()
+    assert kernel < 0.75 * (user + kernel)

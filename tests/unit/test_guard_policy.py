@@ -18,6 +18,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from testkit.policy_library import Library
 
 SECOND = 1_000_000_000
+MS = 1_000_000
 NEVER = 2**64 - 1
 WINDOW_S = 60
 START_S = 1000
@@ -196,6 +197,30 @@ def test_when_it_is_due(interval_s: float, due_s: float | None, again_s: float |
 def test_the_application_runs_before_the_next_one(due_s: float | None, pause_s: int, then_s: float | None) -> None:
     due, then = (NEVER if s is None else s * SECOND for s in (due_s, then_s))
     assert Guarded().c.policy_due_after(due, pause_s * SECOND, 10 * SECOND) == then
+
+
+@pytest.mark.parametrize(
+    ("run", "writes_ms"),
+    [
+        ({"passed_ns": 50 * MS, "cpu_ns": 45 * MS, "ran_ns": 45 * MS}, 20),
+        # Four threads side by side.
+        ({"passed_ns": 50 * MS, "cpu_ns": 190 * MS, "ran_ns": 45 * MS}, 5),
+        # Whoever gets half of a CPU takes twice as long, but not longer than it has been.
+        ({"passed_ns": 50 * MS, "cpu_ns": 25 * MS, "ran_ns": 25 * MS, "waited_ns": 25 * MS}, 40),
+        ({"passed_ns": 50 * MS, "cpu_ns": 10 * MS, "ran_ns": 10 * MS, "waited_ns": 40 * MS}, 50),
+        # The first checkpoint, and one of an application whose main thread sleeps.
+        ({}, 0),
+        ({"passed_ns": 50 * MS, "cpu_ns": 45 * MS}, 20),
+    ],
+)
+def test_first_writes_after_a_clone_hold_the_application_up(run: dict[str, int], writes_ms: int) -> None:
+    guard = Guarded()
+    assert guard.c.policy_writes(20 * MS, _library[0].ffi.new("struct policy_run *", run)) == writes_ms * MS
+
+
+@pytest.mark.parametrize(("held_ms", "writes_ms", "rest_ms"), [(10, 0, 10), (10, 100, 210), (10, 9000, 3010)])
+def test_stops_and_first_writes_take_at_most_half_of_its_time(held_ms: int, writes_ms: int, rest_ms: int) -> None:
+    assert Guarded().c.policy_rest(held_ms * MS, writes_ms * MS) == rest_ms * MS
 
 
 def test_a_failed_checkpoint_leaves_what_is_held_unless_nothing_is_any_good() -> None:

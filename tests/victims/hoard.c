@@ -1,9 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * hoard MB: so much memory, all of it written once.  SIGUSR1: writes all of it
- * again at once; SIGUSR2: 1 MB of it every 100 ms, once through.  Every write
- * under a checkpoint costs a page more.  counter[0] is how many MB were written
- * again so far.  Beats every 1 ms but while it writes at once.
+ * hoard MB [always]: so much memory, all of it written once.  SIGUSR1: writes all
+ * of it again at once; SIGUSR2: 1 MB of it every 100 ms, once through; `always`: all
+ * of it, all the time, without a pause.  Every write under a checkpoint costs a page
+ * more.  counter[0] is how many MB were written again so far.  Beats every 1 ms but
+ * while it writes at once.
  */
 #include <signal.h>
 
@@ -34,6 +35,13 @@ int main(int argc, char **argv)
 	sigaction(SIGUSR1, &act, NULL);
 	sigaction(SIGUSR2, &act, NULL);
 	victim_ready();
+	while (argc > 2) {
+		for (size_t i = 0; i < mb; i++) {
+			memset((void *)(memory + (i << 20)), (int)++loops, 1 << 20);
+			count(0, 1);
+			beat();
+		}
+	}
 	for (;;) {
 		usleep(1000); /* cut short by the signals above */
 		beat();

@@ -176,6 +176,8 @@ ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size);
 #define PROC_TEXT_MAX (8u << 20) /* about 100,000 watched descriptors, or 60,000 files */
 char *proc_text(pid_t pid, const char *name, char *first, size_t first_bytes);
 int proc_stat(pid_t pid, struct proc_stat *stat);
+/* The first write to a page that others have mapped, too (first_write.c). */
+uint64_t first_write_ns(void);
 /* The CPU time of all threads of a process so far; 0: it is gone. */
 uint64_t proc_cpu_ns(pid_t pid);
 /* From an open /proc/PID/stat, which refers to that very process: -1 when it is gone. */

@@ -119,8 +119,10 @@ struct avc_guard {
 	/* CPU time of the guard: since the last checkpoint, and when the current work began.
 	 * CPU time and faults of the app: as of the last checkpoint. */
 	uint64_t pace_cpu_ns, pace_began_ns, pace_app_cpu_ns, pace_faults;
-	uint64_t held_ns;   /* the app was stopped, by all attempts at this one */
-	uint64_t looked_ns; /* at whether the main process has ended (take())    */
+	uint64_t held_ns;      /* the app was stopped, by all attempts at this one */
+	uint64_t writes_ns;    /* its first writes have taken since the last one; auto: 0 */
+	struct policy_run ran; /* up to that one */
+	uint64_t looked_ns;    /* at whether the main process has ended (take())    */
 	struct output output;
 	struct faults faults;
 	uint64_t sent_ns;              /* when the app was last seen to send; 0: never      */

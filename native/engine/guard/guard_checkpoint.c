@@ -656,7 +656,8 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 /* However short its interval is: the app runs for at least as long as it was just stopped. */
 static void let_it_run(struct avc_guard *guard)
 {
-	guard->next_ns = policy_due_after(guard->next_ns, guard->held_ns, now_ns());
+	guard->next_ns = policy_due_after(guard->next_ns,
+					  policy_rest(guard->held_ns, guard->writes_ns), now_ns());
 }
 
 /* One was missed.  avckpt.interval=auto has pauses of its own (guard_pace_missed()). */
@@ -724,7 +725,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 				     "memory is short, so no generation is held");
 		return;
 	}
-	guard->held_ns = 0;
+	guard->held_ns = guard->writes_ns = 0;
 	if (guard_app_is_full(guard)) {
 		fail(&error, AVC_LIMIT, 0, guard->main.pid, "checkpoint", "",
 		     "it fills the memory of its container: what it had before is kept");

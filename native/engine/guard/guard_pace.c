@@ -3,11 +3,12 @@
  * avckpt.interval=auto: measures what checkpoints cost and what the app does between them, and when
  * to take the next one (policy_wants()).
  */
+#include <inttypes.h>
+#include <stdio.h>
 #include <time.h>
 
 #include "guard.h"
 
-#define FAULT_NS 1000 /* the first write to a page after a clone of it             */
 #define TOLD_NS NS_PER_S
 #define SENDS_NS (10 * NS_PER_S) /* an app that has sent counts as a sender for so long      */
 
@@ -64,18 +65,56 @@ void guard_pace_end(struct avc_guard *guard)
 		guard->pace_cpu_ns += own_cpu_ns() - guard->pace_began_ns;
 }
 
+static uint64_t faults_since(struct avc_guard *guard)
+{
+	const uint64_t faults = app_faults(guard), before = guard->pace_faults;
+
+	guard->pace_faults = faults;
+	return before && faults > before ? faults - before : 0;
+}
+
 /* Cost of first writes to pages after the clone; other faults look the same, so it counts for no
  * more than the freeze itself. */
 static uint64_t faults_ns(struct avc_guard *guard, uint64_t freeze_ns)
 {
-	const uint64_t faults = app_faults(guard), before = guard->pace_faults;
-	uint64_t ns;
+	const uint64_t ns = faults_since(guard) * first_write_ns();
 
-	guard->pace_faults = faults;
-	if (!before || faults < before)
-		return 0;
-	ns = (faults - before) * FAULT_NS;
 	return ns < freeze_ns ? ns : freeze_ns;
+}
+
+static uint64_t since(uint64_t now, uint64_t before)
+{
+	return before && now > before ? now - before : 0;
+}
+
+/* Since the last time. */
+static struct policy_run app_run(struct avc_guard *guard)
+{
+	struct policy_run now = { .passed_ns = now_ns(), .cpu_ns = app_cpu_ns(guard) };
+	const struct policy_run before = guard->ran;
+	char text[64];
+
+	if (proc_read(guard->main.leader, "schedstat", text, sizeof text) > 0)
+		(void)sscanf(text, "%" SCNu64 " %" SCNu64, &now.ran_ns, &now.waited_ns);
+	guard->ran = now;
+	return (struct policy_run){ .passed_ns = since(now.passed_ns, before.passed_ns),
+				    .cpu_ns = since(now.cpu_ns, before.cpu_ns),
+				    .ran_ns = since(now.ran_ns, before.ran_ns),
+				    .waited_ns = since(now.waited_ns, before.waited_ns) };
+}
+
+/* The same with a fixed interval, and for no more than all that was cloned. */
+static uint64_t writes_ns(struct avc_guard *guard)
+{
+	const struct generation *newest = &guard->generations[guard->count - 1];
+	const struct policy_run run = app_run(guard);
+	uint64_t faults = faults_since(guard), pages = 0;
+
+	for (uint32_t i = 0; i < newest->images; i++)
+		pages += (uint64_t)newest->image[i].anon_pages;
+	if (faults > pages)
+		faults = pages;
+	return policy_writes(faults * first_write_ns(), &run);
 }
 
 enum avc_fork_reason guard_why_fork(struct avc_guard *guard)
@@ -92,8 +131,11 @@ void guard_pace_taken(struct avc_guard *guard, const struct avc_event *event)
 {
 	struct policy_cost cost;
 
-	if (!policy_is_automatic(&guard->config))
+	if (!policy_is_automatic(&guard->config)) {
+		if (guard->config.interval_ns)
+			guard->writes_ns = writes_ns(guard);
 		return;
+	}
 	guard_pace_end(guard);
 	/* Making the template, and freeing it later. */
 	cost.cpu_ns = guard->pace_cpu_ns + 2 * event->clone_ns;
@@ -129,10 +171,10 @@ void guard_pace_restored(struct avc_guard *guard)
 {
 	guard->next_ns = policy_due(&guard->config, now_ns());
 	faults_disarm(&guard->faults); /* it was the dead one's */
+	guard->pace_faults = 0;
 	if (!policy_is_automatic(&guard->config))
 		return;
 	guard->pace.taken_ns = now_ns();
-	guard->pace_faults = 0;
 	begin_rest(guard);
 }
 

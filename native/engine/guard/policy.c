@@ -16,6 +16,7 @@
 #define MISSES_NS (1000 * MS)
 #define MS UINT64_C(1000000)
 #define FIRST_NS (500 * MS)
+#define WRITES_NS (3000 * MS)
 #define PROOF_NS (1000 * MS) /* an app that lives this long has made progress */
 #define AGAIN_NS (50 * MS)
 #define AVERAGE_OF 8
@@ -74,6 +75,23 @@ uint64_t policy_due(const struct avc_config *config, uint64_t now)
 uint64_t policy_due_after(uint64_t due, uint64_t pause_ns, uint64_t now)
 {
 	return due > now + pause_ns ? due : now + pause_ns;
+}
+
+/* After a clone, first writes take that time before the app is as quick as it was. */
+uint64_t policy_rest(uint64_t held_ns, uint64_t writes_ns)
+{
+	return held_ns + lesser(2 * writes_ns, WRITES_NS);
+}
+
+/* Several threads write side by side; one that waits for a CPU takes longer. */
+uint64_t policy_writes(uint64_t cost_ns, const struct policy_run *run)
+{
+	const uint64_t threads = run->passed_ns ? run->cpu_ns / run->passed_ns + 1 : 1;
+
+	if (run->ran_ns)
+		cost_ns +=
+			(uint64_t)((double)cost_ns * (double)run->waited_ns / (double)run->ran_ns);
+	return lesser(cost_ns / threads, run->passed_ns);
 }
 
 /* Never later than planned, unless there are to be none. */

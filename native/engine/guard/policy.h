@@ -57,6 +57,12 @@ struct policy {
 	uint32_t at_once_lineage;
 };
 
+/* What the app has done in some time. */
+struct policy_run {
+	uint64_t passed_ns, cpu_ns;
+	uint64_t ran_ns, waited_ns; /* its main thread: for a CPU */
+};
+
 /* ---- checkpoints ------------------------------------------------------------- */
 
 /* The first one: the app should make progress before. */
@@ -65,6 +71,11 @@ uint64_t policy_first_due(const struct avc_config *config, uint64_t now);
 uint64_t policy_due(const struct avc_config *config, uint64_t now);
 /* `due`, or later: the app is to run first for as long as that. */
 uint64_t policy_due_after(uint64_t due, uint64_t pause_ns, uint64_t now);
+/* How long it is to run after a checkpoint for which it was stopped for `held_ns`: stops and first
+ * writes to what was cloned take at most half of its time.  For the latter it is 3 s at most. */
+uint64_t policy_rest(uint64_t held_ns, uint64_t writes_ns);
+/* How long first writes that cost `cost_ns` of CPU time have held it up. */
+uint64_t policy_writes(uint64_t cost_ns, const struct policy_run *run);
 /* The one that was due at `due`, by a new configuration. */
 uint64_t policy_due_again(const struct avc_config *config, uint64_t due, uint64_t now);
 
