@@ -106,6 +106,9 @@ class Configuration:
         """
         found = self.path.exists()
         try:
+            # Whoever waits for what a pipe says waits for ever, and nothing else can be read twice.
+            if found and not self.path.is_file():
+                raise ConfigError(f"{self.path}: not a file")
             self.defaults = read(self.path)
         except ConfigError as error:
             self.problem = str(error)

@@ -626,9 +626,11 @@ def test_fifos_in_place_of_its_small_files_hold_nobody_up(
 ) -> None:
     folder = idle_sidecar.run_dir
     folder.joinpath("containers").mkdir(parents=True)
-    for path in ("starting", "present.json", f"containers/{'d' * 64}.json"):
+    for path in ("starting", "present.json", "history.jsonl", f"containers/{'d' * 64}.json"):
         os.mkfifo(folder / path)
+    os.mkfifo(idle_sidecar.config)
     idle_sidecar.start()
+    assert f"the built-in defaults hold: {idle_sidecar.config}: not a file" in idle_sidecar.log
     web = idle_sidecar.protected("web", SLEEPER)
     idle_sidecar.wait_for(web, state="protected")
     assert idle_sidecar.stop() == 0

@@ -213,3 +213,26 @@ def test_nobody_waits_for_a_disk(
     assert [record.getMessage() for record in caplog.records] == [
         f"{folder} does not answer: earlier events are not known"
     ]
+
+
+def test_what_is_in_its_place_holds_nobody_up(path: Path) -> None:
+    os.mkfifo(path)
+    record = History(path).add(died(10.0))
+    assert path.is_file()
+    assert History(path).after() == [record]
+
+
+def test_of_a_long_file_only_the_end_is_read(path: Path) -> None:
+    """Otherwise two million wrong lines take eight seconds, in which the sidecar does not answer."""
+    record = History(path).add(died(10.0))
+    events = path.read_bytes()
+    path.write_bytes(b"{}\n" * 2_000_000 + events)
+    used = time.process_time()
+    assert History(path).after() == [record]
+    assert time.process_time() - used < 2
+    assert path.read_bytes() == events
+    with path.open("r+b") as file:  # a hole, and a torn line
+        file.seek(1 << 30)
+        file.write(b"\n" + events)
+    assert History(path).after() == [record]
+    assert path.read_bytes() == events

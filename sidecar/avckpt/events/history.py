@@ -13,6 +13,7 @@ import dataclasses
 import json
 import logging
 import os
+import stat
 import time
 from collections import Counter, deque
 from pathlib import Path
@@ -27,6 +28,8 @@ log = logging.getLogger("avckpt")
 
 LIMIT = 1000
 """Events kept."""
+FILE_BYTES = 16 << 20
+"""Several times what so many events take: of a longer file only the end is read."""
 AGAIN_S = 10.0
 """A failed write is retried with the first event after this time: a full disk may not stay full."""
 
@@ -123,15 +126,17 @@ class History:
     def _load(self) -> bool:
         """Reads the file; False when it must be rewritten before events are appended."""
         try:
-            content = self._path.read_bytes()
+            content, whole = self._content()
         except FileNotFoundError:
             return True
         except OSError as error:
             self._complain(error)
             return True
-        whole = content.endswith(b"\n") or not content
+        lines = content.splitlines()
+        newest = lines[-2 * self._limit - 1 :]
+        whole &= len(newest) == len(lines) and (content.endswith(b"\n") or not content)
         last = 0
-        for line in content.splitlines():
+        for line in newest:
             self._lines += 1
             try:
                 record = EventRecord.from_json(json.loads(line))
@@ -142,6 +147,23 @@ class History:
                 self._hold(record)
                 last = record.seq
         return whole
+
+    def _content(self) -> tuple[bytes, bool]:
+        """The end of the file, and whether that is all of it and a file.
+
+        What else may be in its place must not hold the start up. Nobody waits for a `durable` one.
+        """
+        with open(self._path, "rb", opener=self._open_at_once) as file:
+            is_file = stat.S_ISREG(os.fstat(file.fileno()).st_mode)
+            size = file.seek(0, os.SEEK_END) if is_file else 0
+            if is_file:
+                file.seek(max(size - FILE_BYTES, 0))
+            elif not self._durable:
+                return b"", False
+            return file.read(FILE_BYTES), is_file and size <= FILE_BYTES
+
+    def _open_at_once(self, name: str, flags: int) -> int:
+        return os.open(name, flags | (0 if self._durable else os.O_NONBLOCK))
 
     def _hold(self, record: EventRecord) -> None:
         whose = _whose(record)
