@@ -38,7 +38,7 @@ from avckpt.containers.names import Names
 from avckpt.containers.presence import Presence
 from avckpt.containers.process import has_ended, is_foreign, pid_of
 from avckpt.containers.protected import Protected, State
-from avckpt.containers.records import NOT_SEEN, Records
+from avckpt.containers.records import NOT_SEEN, Records, keep_private
 from avckpt.containers.registry import Registry
 from avckpt.containers.strangers import let_go
 from avckpt.engine import Engine, Guard
@@ -66,6 +66,7 @@ from avckpt.events.system_journal import SystemJournal
 from avckpt.events.vocabulary import Kind, Reason
 from avckpt.evidence.inquests import Inquests
 from avckpt.guard import Command, Event, GuardConfig, generation_to_json
+from avckpt.lock import Lock
 from avckpt.orders import Orders
 from avckpt.policy import Reloaded, Settings, changes, settings_of
 from avckpt.supervision import watchdog
@@ -96,6 +97,8 @@ class Watch:
     pidfd: int
     labels: Mapping[str, str]
     settings: Settings
+    request: Register
+    """What a sidecar that starts later has to know."""
     rolling_back: Reason | None = None
     """The reason for a commanded rollback that is still unanswered."""
     journal: Journal = field(default_factory=Journal)
@@ -126,8 +129,12 @@ class Watch:
 class Daemon:
     """The whole state of the sidecar. `run()` it once."""
 
-    def __init__(self, run_dir: Path, config_path: Path, beat_fd: int = -1) -> None:
+    def __init__(self, run_dir: Path, config_path: Path, beat_fd: int = -1, lock: Lock | None = None) -> None:
         self.run_dir = run_dir
+        self._lock = lock
+        self._listeners: list[ApiServer | HookListener | units.UnitListener] = []
+        self._misplaced = ""
+        """What was wrong with the runtime directory at the last look."""
         self._beat_fd = beat_fd
         self.configuration = Configuration(config_path)
         self.registry = Registry()
@@ -185,6 +192,7 @@ class Daemon:
             # After the containers that they are in.
             path = self.run_dir / "units" / "units.sock"
             nodes = units.UnitListener(path, self._register_unit, self._is_launchers)
+            self._listeners = [api, hooks, nodes]
             looking = loop.create_task(self._keep_catching_up())
             log.info("avckpt %s is ready, %d container(s) found", __version__, len(self._watches))
             outage = self._presence.since_then(self.registry.live(), self.records.has)
@@ -380,9 +388,50 @@ class Daemon:
                 continue
             due_s = time.monotonic() + LOOK_S
             try:
+                await self._keep_place()
                 self._catch_up()
             except Exception:
                 log.exception("looking for containers that are not protected; it is tried again")
+
+    async def _keep_place(self) -> None:
+        """Makes again what was removed of the runtime directory, or could not be written.
+
+        Guards need nothing there: where that fails, containers that run stay protected, and the log says once
+        that new ones are not.
+        """
+        problem = ""
+        try:
+            if self._lock is not None and not self._lock.is_in_place():
+                self.run_dir.mkdir(mode=0o755, parents=True, exist_ok=True)
+                self._lock.take()
+                log.warning("%s was emptied: it is made again", self.run_dir)
+                for name in ("containers", "health"):
+                    keep_private(self.run_dir / name)
+                self.history.write_again()
+            for listener in self._listeners:
+                made = listener.keep()
+                if made if isinstance(made, bool) else await made:
+                    log.warning("a socket in %s was removed or replaced: it is made again", self.run_dir)
+        except Busy as error:
+            problem = f"{self.run_dir} was emptied: {error}"
+        except OSError as error:
+            problem = (
+                f"{error.filename or self.run_dir} was removed and cannot be made again ({error.strerror}): no "
+                f"container that starts now is protected until the sidecar is restarted"
+            )
+        if problem and problem != self._misplaced:
+            log.error("%s", problem)
+        self._misplaced = problem
+        if not problem:
+            self._keep_records()
+
+    def _keep_records(self) -> None:
+        for watch in self._watches.values():
+            container = watch.container
+            if container.node_of or self.records.has(container.id) or has_ended(watch.pidfd):
+                continue
+            with contextlib.suppress(OSError):  # its hook has said so
+                self.records.write(watch.request, container.init_pid)
 
     def _live_run(self, container_id: str) -> Protected | None:
         """The run of a container that is watched, unless it has just ended."""
@@ -463,7 +512,7 @@ class Daemon:
                 node_of=node_of,
             )
             container.group = settings.policy.group
-        watch = Watch(container, pidfd, request.annotations, settings, bundle=request.bundle)
+        watch = Watch(container, pidfd, request.annotations, settings, request, bundle=request.bundle)
         self.registry.add(container)
         self._watches[container.cookie] = watch
         self._presence.keep(self.registry.live())

@@ -46,6 +46,7 @@ from avckpt.supervision import health
 from avckpt_hooks import VERSION, podman, poststop, precreate, prestart
 from avckpt_hooks import health as hook_health
 from avckpt_hooks.shared import labels, protocol, tell
+from avckpt_hooks.shared.protocol import Register
 
 ID = "ab" * 32
 CONFIG = GuardConfig(3.0, 2, True, True, frozenset(), 5, 60.0, 0.02)
@@ -288,7 +289,11 @@ def api_socket() -> str:
             )
             daemon.registry.add(container)
             # Without a guard: commands are refused, everything else is real.
-            daemon._watches[cookie] = Watch(container, pidfd=-1, labels={}, settings=settings_of({}))
+            request = Register(
+                id=container_id, name=name, pid=container.init_pid, starttime=0, bundle="", annotations={}
+            )
+            settings = settings_of({})
+            daemon._watches[cookie] = Watch(container, pidfd=-1, labels={}, settings=settings, request=request)
         await ApiServer(daemon, path).start()
         ready.set()
         await asyncio.Event().wait()

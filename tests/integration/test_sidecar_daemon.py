@@ -10,6 +10,7 @@ import json
 import os
 import re
 import resource
+import shutil
 import signal
 import stat
 import struct
@@ -616,6 +617,8 @@ def test_a_sidecar_starts_on_a_full_disk_and_protects(idle_sidecar: LocalSidecar
         idle_sidecar.wait_for(web, state="protected")
         os.kill(web.app_pid, signal.SIGKILL)
         idle_sidecar.wait_for(web, restores=1)
+        (folder / "others").unlink()
+        wait_until((folder / f"containers/{web.id}.json").exists, 20, "it is recorded when there is room again")
     finally:
         run(["umount", "--lazy", str(folder)])
 
@@ -723,3 +726,24 @@ def test_the_table_on_a_narrow_terminal(local: LocalSidecar) -> None:
     head, line = (re.sub(r"\x1b\[[0-9;]*m", "", each).split() for each in said.splitlines()[:2])
     assert " ".join(head) == "NAME STATE GENS MEMORY INTERVAL CHECKPOINT FREEZE RESTORES RESTORE NOTE"
     assert line[:3] == ["web", "protected", "2/2"]
+
+
+def test_an_emptied_runtime_directory_is_made_again(local: LocalSidecar) -> None:
+    """The containers stay protected, new ones are, and the next sidecar finds all of them."""
+    web = local.protected("web", SLEEPER)
+    shutil.rmtree(local.run_dir)
+    local.run_dir.mkdir()
+    os.mkfifo(local.run_dir / "hooks.sock")
+    wait_until(lambda: local.log.count("is made again") >= 4, 20, "it is made again")
+    local.wait_for(web, state="protected")
+    second = local.avckpt("sidecar", check=False)
+    assert "a sidecar is running already" in second.stderr
+    other = local.protected("other", SLEEPER)
+    os.kill(web.app_pid, signal.SIGKILL)
+    local.wait_for(web, restores=1)
+    wait_until(lambda: (local.run_dir / f"containers/{web.id}.json").exists(), 10, "it is recorded")
+    local.stop(signal.SIGKILL)
+    local.start()
+    for container in (web, other):
+        local.wait_for(container, state="protected", adopted=True)
+    assert any(event["kind"] == "restored" for event in local.client.history())

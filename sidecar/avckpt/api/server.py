@@ -45,6 +45,7 @@ from avckpt.events.history import History
 from avckpt.events.metrics import CONTENT_TYPE, Metrics
 from avckpt.events.record import EventRecord
 from avckpt.guard import Command
+from avckpt.lock import identity
 from avckpt.policy import Reloaded
 from avckpt.supervision.pressure import measure
 
@@ -119,7 +120,21 @@ class ApiServer:
     async def start(self) -> None:
         """Starts to serve.  Raises OSError when the socket cannot be made."""
         await self._runner.setup()
-        await web.SockSite(self._runner, bind_socket(self._path, socket.SOCK_STREAM)).start()
+        await self._listen()
+
+    async def keep(self) -> bool:
+        """Makes the socket again if its file was removed or replaced; whether it was.  Raises OSError."""
+        if identity(self._path) == self._file:
+            return False
+        before = self._site
+        await self._listen()
+        await before.stop()
+        return True
+
+    async def _listen(self) -> None:
+        self._site = web.SockSite(self._runner, bind_socket(self._path, socket.SOCK_STREAM))
+        self._file = identity(self._path)
+        await self._site.start()
 
     async def close(self) -> None:
         """Ends what is under way, within a second, and removes the socket."""

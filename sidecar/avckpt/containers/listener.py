@@ -20,6 +20,7 @@ from avckpt_hooks.shared import protocol
 from avckpt_hooks.shared.protocol import Deregister, Register
 
 from avckpt.errors import AvckptError, of_any
+from avckpt.lock import identity
 
 log = logging.getLogger("avckpt")
 
@@ -62,7 +63,23 @@ class HookListener:
         self._pause: asyncio.TimerHandle | None = None
         self._is_short = False
         """The last accept failed, which has been logged."""
-        self._socket = bind_socket(path, socket.SOCK_SEQPACKET)
+        self._listen()
+
+    def keep(self) -> bool:
+        """Makes the socket again if its file was removed or replaced; whether it was.  Raises OSError."""
+        if identity(self._path) == self._file:
+            return False
+        before, paused = self._socket, self._pause
+        self._listen()
+        if paused is not None:
+            paused.cancel()
+        self._loop.remove_reader(before)
+        before.close()
+        return True
+
+    def _listen(self) -> None:
+        self._socket = bind_socket(self._path, socket.SOCK_SEQPACKET)
+        self._file = identity(self._path)
         self._loop.add_reader(self._socket, self._accept)
 
     def close(self) -> None:

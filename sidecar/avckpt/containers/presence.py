@@ -44,8 +44,9 @@ class Presence:
         content = json.dumps({"stopped": stopped, "containers": there}).encode()
         with contextlib.suppress(OSError):
             if content == self._written:
-                os.utime(self._path)
-                return
+                with contextlib.suppress(FileNotFoundError):  # somebody has removed it
+                    os.utime(self._path)
+                    return
             write_at_once(str(self._path), content)
             self._written = content
 

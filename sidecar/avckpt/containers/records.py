@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from avckpt_hooks.shared.files import make_private, read_own
+from avckpt_hooks.shared.files import make_private, read_own, write_private
 from avckpt_hooks.shared.protocol import MAX_BYTES, Register
 
 from avckpt.containers.process import open_pidfd
@@ -78,6 +78,13 @@ class Records:
             else:
                 if found is not None:
                     yield found
+
+    def write(self, request: Register, init_pid: int) -> None:
+        """Does what the hook could not do, or what somebody has removed, for a container that lives.  Raises
+        OSError."""
+        record = {**request.record(), "pid": init_pid, "pid_namespace": OWN_NAMESPACE}
+        path = self._directory.joinpath(f"{request.id}.json")
+        write_private(str(path), json.dumps(record).encode() + b"\n")
 
     def has(self, container_id: str) -> bool:
         """Whether there is a record of that container."""

@@ -29,6 +29,7 @@ from avckpt.bucket import Bucket
 from avckpt.containers.process import has_ended, is_foreign, pid_of, start_time, status
 from avckpt.containers.strangers import is_busy, let_go, receive, received
 from avckpt.errors import AvckptError, Busy, Denied, LabelsWrong, TargetGone, of_any
+from avckpt.lock import identity
 
 log = logging.getLogger("avckpt")
 
@@ -287,7 +288,21 @@ class UnitListener:
         self._leaving: list[socket.socket] = []
         self._reading: dict[socket.socket, socket.socket] = {}
         """By connection: where what it said will be."""
-        self._socket = listen(path)
+        self._listen()
+
+    def keep(self) -> bool:
+        """Makes the socket again if its file was removed or replaced; whether it was.  Raises OSError."""
+        if identity(self._path) == self._file:
+            return False
+        before = self._socket
+        self._listen()
+        self._loop.remove_reader(before)
+        self._part(before)
+        return True
+
+    def _listen(self) -> None:
+        self._socket = listen(self._path)
+        self._file = identity(self._path)
         self._loop.add_reader(self._socket, self._accept)
 
     def close(self) -> None:

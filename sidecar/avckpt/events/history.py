@@ -95,6 +95,10 @@ class History:
             if (seq is None or record.seq > seq) and (since is None or record.at >= since)
         ]
 
+    def write_again(self) -> None:
+        """Writes the file again: it was removed."""
+        self._compact()
+
     def sync(self) -> None:
         """Has the disk write what was kept.  Blocks."""
         if self._fd >= 0:
