@@ -106,11 +106,13 @@ static struct policy_run app_run(struct avc_guard *guard)
 /* The same with a fixed interval, and for no more than all that was cloned. */
 static uint64_t writes_ns(struct avc_guard *guard)
 {
-	const struct generation *newest = &guard->generations[guard->count - 1];
+	/* 0: somebody has killed its templates already. */
+	const struct generation *newest = guard->count ? &guard->generations[guard->count - 1]
+						       : NULL;
 	const struct policy_run run = app_run(guard);
 	uint64_t faults = faults_since(guard), pages = 0;
 
-	for (uint32_t i = 0; i < newest->images; i++)
+	for (uint32_t i = 0; newest && i < newest->images; i++)
 		pages += (uint64_t)newest->image[i].anon_pages;
 	if (faults > pages)
 		faults = pages;
