@@ -26,10 +26,14 @@ from typing import Any
 import pytest
 from avckpt.guard import GuardConfig, Images
 
+from testkit import guard_peer
 from testkit.board import UNAVAILABLE_STATUS, Board, Seen
+from testkit.forked import Forked, preload
 from testkit.harness import ROOT, SLOWNESS, app_pid, wait_until
 from testkit.init_peer import Init
 from testkit.procfs import children_of, inside
+
+preload("testkit.guard_peer")
 
 BUILD = ROOT / "tests/victims/build"
 PATIENCE_S = 60.0 * SLOWNESS
@@ -67,13 +71,12 @@ class GuardProcess:
     def __init__(self, guard_config: GuardConfig, inits: Sequence[int]) -> None:
         fields = dataclasses.asdict(guard_config)
         fields["restore_on_statuses"] = sorted(guard_config.restore_on_statuses)
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "testkit.guard_peer", json.dumps(fields), *map(str, inits)],
-            cwd=ROOT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        stdin, commands = os.pipe()
+        answers, stdout = os.pipe()
+        self.process = Forked(guard_peer.main, [json.dumps(fields), *map(str, inits)], stdin=stdin, stdout=stdout)
+        os.close(stdin)
+        os.close(stdout)
+        self._commands, self._answers = os.fdopen(commands, "w"), os.fdopen(answers)
         self.events: list[Json] = []
         self._news = threading.Condition()
         self._ended = False
@@ -89,11 +92,9 @@ class GuardProcess:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.kill()
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
         self._reader.join()
-        self.process.stdin.close()
-        self.process.stdout.close()
+        self._commands.close()
+        self._answers.close()
 
     @property
     def pid(self) -> int:
@@ -220,15 +221,13 @@ class GuardProcess:
         self.wait("stopped", since=since)
 
     def _say(self, line: str) -> int:
-        assert self.process.stdin is not None
         self._tickets += 1
-        self.process.stdin.write((line % self._tickets if "%d" in line else line) + "\n")
-        self.process.stdin.flush()
+        self._commands.write((line % self._tickets if "%d" in line else line) + "\n")
+        self._commands.flush()
         return self._tickets
 
     def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
+        for line in self._answers:
             with self._news:
                 self.events.append(json.loads(line))
                 if self.events[-1].get("kind") == "started":

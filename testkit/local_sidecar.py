@@ -16,12 +16,16 @@ from typing import Any
 
 from avckpt.artifacts import hooks_source, init_binary
 from avckpt.cli.client import Client
+from avckpt.cli.commands import main
 from avckpt.containers.process import has_ended
 from avckpt.errors import SidecarUnreachable
 from avckpt_hooks import VERSION
 
+from testkit.forked import Forked, preload
 from testkit.harness import ROOT, Completed, Podman, avckpt_command, run, wait_until, write_hooks
 from testkit.procfs import children_of, inside
+
+preload("avckpt.daemon")
 
 QUICK = {"avckpt.enable": "true", "avckpt.interval": "100ms"}
 ON_COMMAND = {"avckpt.enable": "true", "avckpt.interval": "1h"}
@@ -76,7 +80,7 @@ class LocalSidecar:
 
     run_dir: Path
     command: Sequence[str] = field(default_factory=avckpt_command)
-    process: subprocess.Popen[bytes] | None = None
+    process: subprocess.Popen[bytes] | Forked | None = None
     containers: list[Container] = field(default_factory=list)
 
     @property
@@ -94,15 +98,17 @@ class LocalSidecar:
         path = self.run_dir.with_suffix(".log")
         return path.read_text() if path.exists() else ""
 
-    def start(self, *options: str, stderr: int | None = None) -> None:
-        """Starts it and waits until it answers."""
-        with self.run_dir.with_suffix(".log").open("ab") as log:
-            self.process = subprocess.Popen(
-                [*self.command, "sidecar", *options],
-                stderr=log if stderr is None else stderr,
-                env={**os.environ, **self.env},
-                stdin=subprocess.DEVNULL,
-            )
+    def start(self, *options: str, stderr: int | None = None, inherits: bool = False) -> None:
+        """Starts it and waits until it answers; `inherits`: from this process, limits for example."""
+        env = {**os.environ, **self.env}
+        with self.run_dir.with_suffix(".log").open("ab") as log, open(os.devnull, "rb") as null:
+            stderr = log.fileno() if stderr is None else stderr
+            if inherits or self.command != avckpt_command():
+                self.process = subprocess.Popen(
+                    [*self.command, "sidecar", *options], stderr=stderr, env=env, stdin=null
+                )
+            else:
+                self.process = Forked(_main, ["sidecar", *options], stdin=null.fileno(), stderr=stderr, env=env)
         wait_until(self._answers, 60, "the sidecar answers")
 
     def stop(self, signum: int = signal.SIGTERM) -> int:
@@ -216,6 +222,10 @@ class LocalSidecar:
             return pid in (self.process.pid, *children_of(self.process.pid))  # it may have a watchdog
         except SidecarUnreachable:
             return False
+
+
+def _main() -> None:
+    main(prog_name="avckpt")
 
 
 @contextlib.contextmanager

@@ -453,7 +453,7 @@ def test_it_takes_all_the_descriptors_it_may(idle_sidecar: LocalSidecar) -> None
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
     try:
-        idle_sidecar.start()
+        idle_sidecar.start(inherits=True)
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     assert idle_sidecar.process is not None
