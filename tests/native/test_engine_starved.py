@@ -90,10 +90,10 @@ def too_late(event: dict[str, object]) -> bool:
 
 
 def checkpoint_until_late(guard: GuardProcess, cpu: int, pause_s: Callable[[], float] = float) -> None:
-    """Beside a hog, until threads have been too late often enough, or for 20 s and once; nobody dies of it."""
+    """Beside a hog, until threads have been too late often enough, or for 8 s and once; nobody dies of it."""
     with hog(cpu):
         begun, late = time.monotonic(), 0
-        while late < ENOUGH and time.monotonic() < begun + (20 if late else 90):
+        while late < ENOUGH and time.monotonic() < begun + (8 if late else 90):
             guard.command("checkpoint")
             time.sleep(pause_s())
             late = sum(map(too_late, guard.events))
