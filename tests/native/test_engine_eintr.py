@@ -19,7 +19,7 @@ from testkit.procfs import status_of
 
 pytestmark = pytest.mark.shared_machine("timeouts of blocked calls are compared with the clock")
 
-CHECKPOINTS = 10_000 if os.environ.get("AVCKPT_LONG") == "1" else 500
+CHECKPOINTS = 10_000 if os.environ.get("AVCKPT_LONG") == "1" else 300
 ROUSING = 1_000
 HUGE_PAGES = 8
 LONGEST, PUNCTUAL = 3, 7
