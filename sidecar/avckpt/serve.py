@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import resource
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,15 +14,28 @@ from avckpt.containers import cgroup
 from avckpt.containers.records import keep_private
 from avckpt.daemon import Daemon
 from avckpt.engine import probe
-from avckpt.errors import AvckptError, Denied
+from avckpt.errors import AvckptError, Busy, Denied
 from avckpt.lock import Lock
+
+KILLED_S = 2.0
 
 
 @contextmanager
 def only_one(run_dir: Path) -> Iterator[Lock]:
-    """Holds the lock that says there is a sidecar.  Raises Busy when another one holds it."""
+    """Holds the lock that says there is a sidecar.  Raises Busy when another one holds it.
+
+    One that was killed a moment ago holds it for as long as one of its threads waits for a disk.
+    """
     lock = Lock(run_dir)
-    lock.take()
+    end = time.monotonic() + KILLED_S
+    while True:
+        try:
+            lock.take()
+            break
+        except Busy:
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.05)
     try:
         yield lock
     finally:

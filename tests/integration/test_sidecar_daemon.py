@@ -650,6 +650,17 @@ def test_a_second_sidecar_refuses_and_the_first_goes_on(local: LocalSidecar) -> 
     assert local.ps() == []
 
 
+def test_one_that_is_still_ending_is_waited_for(idle_sidecar: LocalSidecar) -> None:
+    """Killed, it has its descriptors as long as a thread of it waits for a disk."""
+    idle_sidecar.run_dir.mkdir()
+    with (idle_sidecar.run_dir / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        ends = threading.Timer(1.5, lock.close)
+        ends.start()
+        idle_sidecar.start()
+        ends.join()
+
+
 def test_without_privileges_it_says_so(tmp_path: Path) -> None:
     refused = run(
         ["setpriv", "--bounding-set=-sys_ptrace,-sys_admin", "--inh-caps=-all", *avckpt_command(), "sidecar"],
