@@ -27,7 +27,7 @@ def local(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[LocalSide
     """A sidecar as Podman starts it, and one container."""
     monkeypatch.setenv("container", "podman")
     with local_sidecar(tmp_path) as made:
-        made.start()
+        made.start(inherits=True)  # whether it has a watchdog is decided when it is imported
         yield made
 
 
