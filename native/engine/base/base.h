@@ -65,9 +65,15 @@
 /* Fills *err in unless it holds an error already.  Always returns -1. */
 int fail(struct avc_error *err, enum avc_code code, int errnum, pid_t pid, const char *operation,
 	 const char *syscall, const char *detail, ...) __attribute__((format(printf, 7, 8)));
-/* The same with the code that suits errno: ESRCH gone, EPERM denied, else kernel. */
+/* The same with the code that suits errno: ESRCH gone, EPERM denied, else kernel.  Of a shortage it
+ * says that instead of `detail`. */
 int fail_errno(struct avc_error *err, pid_t pid, const char *operation, const char *syscall,
 	       const char *detail, ...) __attribute__((format(printf, 5, 6)));
+/* malloc(3) and the like have failed, perhaps some calls ago. */
+int fail_memory(struct avc_error *err, pid_t pid, const char *operation);
+/* Whether it means that we, or the machine, have no descriptors or memory left: which says nothing
+ * about the process that was looked at. */
+bool is_shortage(int errnum);
 uint64_t now_ns(void);
 struct timespec timespec_of(uint64_t ns);
 void close_fd(int *fd);
@@ -184,7 +190,8 @@ uint64_t proc_cpu_ns(pid_t pid);
 int proc_stat_of(int stat_fd, struct proc_stat *stat);
 /* The number of a task in its own (innermost) PID namespace, or -1. */
 pid_t proc_inside(pid_t tid);
-/* A live thread of the process: the main thread, if it has not exited. 0: none. */
+/* A live thread of the process: the main thread, if it has not exited.  0: none (errno ESRCH), or it
+ * cannot be seen (any other). */
 pid_t proc_live_thread(pid_t pid);
 /* Waits until that thread has exited; a second at most. */
 void proc_await_end(pid_t tid);
@@ -231,7 +238,8 @@ static inline uint64_t device_of(const struct statx *st)
 }
 /* Whether that link of both leads to the same file: 1 or 0; -1: unknown.  Asks no file server. */
 int proc_same_file(pid_t a, pid_t b, const char *name);
-/* It is exiting, and may have closed its descriptors already. */
+/* It is exiting, and may have closed its descriptors already.  Not if it cannot be seen (is_shortage()):
+ * then neither this nor proc_is_killed() says that it ends. */
 bool proc_is_exiting(pid_t tid);
 /* Whether it was killed by SIGKILL, even if it has not exited yet. */
 bool proc_is_killed(pid_t pid);

@@ -43,6 +43,28 @@ int fail(struct avc_error *err, enum avc_code code, int errnum, pid_t pid, const
 	return -1;
 }
 
+bool is_shortage(int errnum)
+{
+	return errnum == EMFILE || errnum == ENFILE || errnum == ENOMEM;
+}
+
+static const char *shortage(int errnum)
+{
+	switch (errnum) {
+	case EMFILE:
+		return "its guard may not open any more files";
+	case ENFILE:
+		return "too many files are open on this machine";
+	default:
+		return "its guard gets no more memory";
+	}
+}
+
+int fail_memory(struct avc_error *err, pid_t pid, const char *operation)
+{
+	return fail(err, AVC_KERNEL, ENOMEM, pid, operation, "malloc", "%s", shortage(ENOMEM));
+}
+
 int fail_errno(struct avc_error *err, pid_t pid, const char *operation, const char *syscall,
 	       const char *detail, ...)
 {
@@ -50,6 +72,8 @@ int fail_errno(struct avc_error *err, pid_t pid, const char *operation, const ch
 	enum avc_code code = AVC_KERNEL;
 	va_list args;
 
+	if (is_shortage(errnum))
+		return fail(err, code, errnum, pid, operation, syscall, "%s", shortage(errnum));
 	/* For a process that has just been reaped, Yama (ptrace_scope 1, as on Ubuntu) returns
 	 * EPERM. */
 	if (errnum == ESRCH || errnum == ENOENT)

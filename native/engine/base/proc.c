@@ -225,13 +225,16 @@ pid_t proc_live_thread(pid_t pid)
 	pid_t found = 0;
 	int dirfd;
 
+	errno = 0;
 	if (is_live(pid))
 		return pid;
-	dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
-	if (dirfd < 0)
-		return 0;
-	(void)proc_numbers(dirfd, find_live, &found);
-	close(dirfd);
+	dirfd = is_shortage(errno) ? -1 : proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
+	if (dirfd >= 0) {
+		(void)proc_numbers(dirfd, find_live, &found);
+		close(dirfd);
+	}
+	if (!found && !is_shortage(errno))
+		errno = ESRCH;
 	return found;
 }
 
@@ -474,7 +477,9 @@ bool proc_is_exiting(pid_t tid)
 {
 	struct proc_stat stat;
 
-	return proc_stat(tid, &stat) || stat.flags & PF_EXITING;
+	if (proc_stat(tid, &stat))
+		return !is_shortage(errno);
+	return stat.flags & PF_EXITING;
 }
 
 /* All threads get the flag before the kernel writes a core (kernel/signal.c, get_signal()). */
@@ -496,9 +501,13 @@ bool proc_is_killed(pid_t pid)
 {
 	static const char *const sets[] = { "\nSigPnd:", "\nShdPnd:" };
 	char buf[4096];
+	ssize_t n;
 
-	if (proc_is_exiting(pid) || proc_read(pid, "status", buf, sizeof buf) <= 0)
+	if (proc_is_exiting(pid))
 		return true;
+	n = proc_read(pid, "status", buf, sizeof buf);
+	if (n <= 0)
+		return n == 0 || !is_shortage(errno);
 	for (size_t i = 0; i < sizeof sets / sizeof *sets; i++) {
 		const char *line = strstr(buf, sets[i]);
 

@@ -27,7 +27,7 @@ int generation_make_room(struct generation *generation, uint32_t images, struct 
 	struct image *more = realloc(generation->image, images * sizeof *more);
 
 	if (!more)
-		return fail_errno(err, 0, "freeze", "realloc", "out of memory");
+		return fail_memory(err, 0, "freeze");
 	generation->image = more;
 	return 0;
 }
@@ -74,7 +74,7 @@ static int keep_inherited(struct image *image, struct avc_error *err)
 
 	image->inherited = calloc(1, sizeof *image->inherited);
 	if (!image->inherited)
-		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
+		return fail_memory(err, 0, "keep template");
 	inherited_answer(&image->process->parasite, image->slot, image->inherited, &ignored);
 	if (cloned)
 		inherited_creds(image->inherited, cloned);

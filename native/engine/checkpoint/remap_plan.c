@@ -65,7 +65,7 @@ static int cut(struct remap *r, struct avc_error *err)
 
 	r->piece = calloc(2 * (is_maps->count + want_maps->count) + 2, sizeof *r->piece);
 	if (!r->piece)
-		return fail_errno(err, 0, "restore memory", "calloc", "out of memory");
+		return fail_memory(err, 0, "restore memory");
 	for (;;) {
 		const struct mapping *a = at(is_maps, &is, address);
 		const struct mapping *b = at(want_maps, &want, address);
@@ -133,7 +133,7 @@ static int add_run(struct remap *r, const struct mapping *m, enum page what, avc
 		return 0;
 	}
 	if (!make_room(&r->run, r->runs, &r->room, sizeof *r->run))
-		return fail_errno(err, 0, "restore memory", "realloc", "out of memory");
+		return fail_memory(err, 0, "restore memory");
 	r->run[r->runs++] = (struct run){ start, end, what, plain };
 	return 0;
 }
@@ -175,7 +175,7 @@ struct remap *remap_plan(const struct process *process, struct snapshot *want, s
 	struct remap *r = calloc(1, sizeof *r);
 
 	if (!r) {
-		fail_errno(err, 0, "restore memory", "calloc", "out of memory");
+		fail_memory(err, 0, "restore memory");
 		return NULL;
 	}
 	*r = (struct remap){ .process = process, .want = want, .is = is };

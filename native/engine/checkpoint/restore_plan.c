@@ -37,14 +37,14 @@ int restore_plan_begin(struct generation *generation, uint64_t ahead_ns, struct 
 		return 0;
 	all = calloc(1, sizeof *all + generation->images * sizeof *all->entry);
 	if (!all)
-		return fail_errno(err, 0, "restore memory", "calloc", "out of memory");
+		return fail_memory(err, 0, "restore memory");
 	all->left_ns = ahead_ns;
 	all->next = 1;
 	all->entries = generation->images;
 	all->place = calloc(generation->images, sizeof *all->place);
 	if (!all->place || places_find(generation, all->place, err)) {
 		if (!all->place)
-			fail_errno(err, 0, "restore memory", "calloc", "out of memory");
+			fail_memory(err, 0, "restore memory");
 		free(all->place);
 		free(all);
 		return -1;

@@ -33,7 +33,7 @@ struct snapshot *snapshot_new(pid_t template, const struct mem_image *image, str
 	struct snapshot *snapshot = calloc(1, sizeof *snapshot);
 
 	if (!snapshot) {
-		fail_errno(err, template, "restore memory", "calloc", "out of memory");
+		fail_memory(err, template, "restore memory");
 		return NULL;
 	}
 	snapshot->template = template;
@@ -47,7 +47,7 @@ struct snapshot *snapshot_new(pid_t template, const struct mem_image *image, str
 		snapshot->maps.map[i].flags = mem_image_marks(image, snapshot->maps.map[i].start);
 	snapshot->pages = calloc(snapshot->maps.count + 1, sizeof *snapshot->pages);
 	if (!snapshot->pages) {
-		fail_errno(err, template, "restore memory", "calloc", "out of memory");
+		fail_memory(err, template, "restore memory");
 		snapshot_free(snapshot);
 		return NULL;
 	}

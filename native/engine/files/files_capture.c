@@ -124,7 +124,11 @@ static struct files *look_before(struct process *process, const struct process *
 				   .reuses = !process->heirs_change && files_trusts_heirs(process) }
 		};
 	if (!job || !job->files || job->owner.pidfd < 0) {
-		fail_errno(err, process->pid, "look at descriptors", "calloc", "out of memory");
+		if (!job || !job->files)
+			fail_memory(err, process->pid, "look at descriptors");
+		else
+			fail_errno(err, process->pid, "look at descriptors", "fcntl(DUPFD)",
+				   "its pidfd cannot be duplicated");
 		if (job)
 			drop_survey(&job->aside);
 		return NULL;
@@ -147,7 +151,7 @@ static struct files *look_before(struct process *process, const struct process *
 	if (job->result) {
 		*err = err->code ? *err : job->error;
 	} else if (!note_heirs(job->files)) {
-		fail_errno(err, process->pid, "look at descriptors", "malloc", "out of memory");
+		fail_memory(err, process->pid, "look at descriptors");
 	} else {
 		files = job->files;
 		job->files = NULL;
@@ -176,8 +180,7 @@ int files_prepare(struct process *process, const struct process *parent, struct 
 		process->files_before = NULL;
 		process->files_image = files_new(1); /* they are its parent's */
 		return process->files_image ? 0
-					    : fail_errno(err, process->pid, "look at descriptors",
-							 "calloc", "out of memory");
+					    : fail_memory(err, process->pid, "look at descriptors");
 	}
 	before = look_before(process, parent, err);
 	if (!before)
@@ -188,8 +191,7 @@ int files_prepare(struct process *process, const struct process *parent, struct 
 	note_sockets(process, before);
 	image = files_new(before->count + before->count / 4 + ROOM_SPARE);
 	if (!image)
-		return fail_errno(err, process->pid, "look at descriptors", "calloc",
-				  "out of memory");
+		return fail_memory(err, process->pid, "look at descriptors");
 	/* Touched now: otherwise the first touch would fault while the app is stopped. (A compiler
 	 * leaves out memset(3) after calloc(3).) */
 	explicit_bzero(image->file, image->room * sizeof *image->file);

@@ -373,8 +373,7 @@ static int make_room_for_one(const struct look *look, struct avc_error *err)
 			    "more descriptors than prepared for");
 	more = realloc(files->file, 2 * files->room * sizeof *more);
 	if (!more)
-		return fail_errno(err, look->pid, "look at descriptors", "realloc",
-				  "out of memory");
+		return fail_memory(err, look->pid, "look at descriptors");
 	memset(more + files->room, 0, files->room * sizeof *more);
 	files->file = more;
 	files->room *= 2;

@@ -652,7 +652,7 @@ static int tables_begin(struct tables *tables, struct image *image, uint32_t ima
 static int place(struct tables *tables, struct avc_error *err)
 {
 	if (list_spots(tables, &tables->ends, false) || list_spots(tables, &tables->family, true))
-		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+		return fail_memory(err, 0, "restore descriptors");
 	see_to_pairs(tables, true);
 	if (tables->count > 1)
 		join(tables);
@@ -695,7 +695,7 @@ int files_restore(struct image *image, uint32_t images, const struct avc_config 
 	int result, dropped = 0;
 
 	if (!tables.work)
-		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
+		return fail_memory(err, 0, "restore descriptors");
 	files_find_strange(image, images, config);
 	result = tables_begin(&tables, image, images, &common, err);
 	if (!result)

@@ -238,7 +238,7 @@ int look_leave_heirs(struct look *look, struct avc_error *err)
 	int result = 0;
 
 	if (!at)
-		return fail_errno(err, look->pid, "freeze", "calloc", "out of memory");
+		return fail_memory(err, look->pid, "freeze");
 	for (uint32_t i = 0; !result && i < parent->varied_count; i++) {
 		const struct file *k = files_find(known, parent->varied[i]);
 

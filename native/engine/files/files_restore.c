@@ -620,7 +620,7 @@ static int numbers_begin(struct numbers *numbers, const struct files_work *work,
 	numbers->room = 16 + (want->count ? want->file[want->count - 1].fd : 0);
 	numbers->taken = calloc((size_t)numbers->room, 1);
 	if (!numbers->taken)
-		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
+		return fail_memory(err, 0, "restore descriptors");
 	for (uint32_t i = 0; i < work->now->count; i++)
 		if (!work->closed[i])
 			numbers->taken[work->now->file[i].fd] = 1;
@@ -838,7 +838,7 @@ static int find_missing(const struct files_work *work, struct files_missing *mis
 {
 	missing->file = calloc(work->want->count + 1, sizeof *missing->file);
 	if (!missing->file)
-		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
+		return fail_memory(err, 0, "restore descriptors");
 	for (uint32_t i = 0; i < work->want->count; i++) {
 		const struct file *w = &work->want->file[i];
 
@@ -872,7 +872,7 @@ static int look_once(struct files_work *work, const struct files_missing *missin
 		return -1;
 	work->claimed_by = filled(work->now->count, -1);
 	if (!work->claimed_by)
-		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+		return fail_memory(err, 0, "restore descriptors");
 	find_staying(work);
 	return 0;
 }
@@ -904,7 +904,7 @@ static int look(struct files_work *work, struct avc_error *err)
 		work->lost[i] = false;
 	}
 	result = work->now ? look_once(work, &missing, err)
-			   : fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
+			   : fail_memory(err, 0, "restore descriptors");
 	free(missing.file);
 	return result;
 }
@@ -917,7 +917,7 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 	work->lost = calloc(work->want->count + 1, sizeof *work->lost);
 	work->kept = calloc(work->want->count + 1, sizeof *work->kept);
 	if (!work->now || !work->local || !work->source || !work->lost || !work->kept)
-		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+		return fail_memory(err, 0, "restore descriptors");
 	/* The app died while it was cloning (guard_checkpoint.c, abandon()). */
 	if (work->table && work->process->descendant && work->process->doubtful &&
 	    tracee_halt(work->table, err))
@@ -931,7 +931,7 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 	}
 	work->closed = calloc(work->now->count + 1, sizeof *work->closed);
 	if (!work->closed || !files_order(&work->order, work->now))
-		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+		return fail_memory(err, 0, "restore descriptors");
 	find_moved(work);
 	give_up_useless(work);
 	cut_strange(work);
@@ -1067,7 +1067,7 @@ int files_work_table(const struct files_work *work, struct fd_table *table, stru
 {
 	table->entry = calloc(work->want->count + 1, sizeof *table->entry);
 	if (!table->entry)
-		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
+		return fail_memory(err, 0, "restore descriptors");
 	for (uint32_t i = 0; i < work->want->count; i++) {
 		const struct file *w = &work->want->file[i];
 		const int local = work->local[files_leader(work->want, w)];

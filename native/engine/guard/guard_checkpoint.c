@@ -49,10 +49,13 @@ int guard_find_app(struct avc_guard *guard, struct avc_error *err)
 
 	if (guard->main.pid)
 		return 0;
+	errno = 0;
 	app = init_channel_app(&guard->channel);
 	if (!app || !init_channel_app_started(&guard->channel, app))
-		return fail(err, AVC_DEADLINE, 0, 0, "attach", "",
-			    "the application has not been started yet");
+		return is_shortage(errno) ? fail_errno(err, 0, "attach", "open(children)",
+						       "the application cannot be looked for")
+					  : fail(err, AVC_DEADLINE, 0, 0, "attach", "",
+						 "the application has not been started yet");
 	guard->main.init = guard->channel.init;
 	if (proc_status(guard->channel.init, &init) == 0)
 		guard->main.plain_filters = init.seccomp_filters;

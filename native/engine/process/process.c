@@ -65,7 +65,7 @@ static int follow(struct process *process, struct avc_error *err)
 	const pid_t pid = proc_live_thread(process->leader);
 
 	if (!pid)
-		return fail(err, AVC_GONE, ESRCH, process->leader, "attach", "", "it has ended");
+		return fail_errno(err, process->leader, "attach", "open(stat)", "it has ended");
 	close_fd(&process->pidfd);
 	close_fd(&process->statm_fd);
 	close_fd(&process->status_fd);
@@ -132,6 +132,8 @@ void process_hasten_no_more(const struct process *process)
 
 int process_open(struct process *process, pid_t pid, pid_t inside, struct avc_error *err)
 {
+	if (inside < 0)
+		return fail_errno(err, pid, "attach", "open(status)", "it has ended");
 	process->leader = pid;
 	process->inside = inside;
 	process->parasite.left_ns = 0; /* by a thread of the process before */

@@ -169,7 +169,7 @@ int tracker_begin(struct process *process, timer_t timer, struct avc_error *err)
 	struct tracker *tracker = calloc(1, sizeof *tracker);
 
 	if (!tracker)
-		return fail_errno(err, 0, "watch memory", "calloc", "out of memory");
+		return fail_memory(err, 0, "watch memory");
 	tracker->number = ++number;
 	tracker->scanned_ns = now_ns();
 	tracker->pagemap = proc_open(process->pid, "pagemap", O_RDONLY);
@@ -289,7 +289,7 @@ int tracker_watch(struct process *process, char *layout, struct avc_error *err)
 	if (text)
 		fclose(text);
 	if (result)
-		return fail_errno(err, process->pid, "watch memory", "fmemopen", "out of memory");
+		return fail_memory(err, process->pid, "watch memory");
 	if (watch.refused.end && proc_mappings(process->pid, "smaps", check_refused, &watch))
 		return fail(err, AVC_UNSUPPORTED, errno, process->pid, "watch memory",
 			    "ioctl(UFFDIO_REGISTER)", "some of it cannot be watched");

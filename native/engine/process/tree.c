@@ -149,7 +149,9 @@ static bool has_ended(pid_t pid)
 {
 	struct proc_stat stat;
 
-	return proc_stat(pid, &stat) || is_zombie(&stat);
+	if (proc_stat(pid, &stat))
+		return !is_shortage(errno);
+	return is_zombie(&stat);
 }
 
 /* A child of init that does not belong to the app. */
@@ -161,6 +163,14 @@ static int is_none(struct tree *tree, pid_t pid, struct avc_error *err)
 	return is_clone(tree, pid, err);
 }
 
+/* Nobody may be left out because we cannot look. */
+static int not_listed(pid_t tid, struct avc_error *err)
+{
+	return is_shortage(errno) ? fail_errno(err, tid, "look at processes", "open(children)",
+					       "its children cannot be listed")
+				  : 0;
+}
+
 /* A child is listed under the thread that forked it. */
 static int look_at_task(pid_t tid, void *arg)
 {
@@ -168,6 +178,8 @@ static int look_at_task(pid_t tid, void *arg)
 	pid_t children[CHILDREN_MAX];
 	const int count = proc_children_of(look->task_dirfd, tid, children, CHILDREN_MAX);
 
+	if (count < 0)
+		return not_listed(tid, look->err);
 	for (int i = 0; i < count; i++)
 		if (add_entry(look->tree, children[i], look->parent, look->err))
 			return -1;
@@ -188,6 +200,8 @@ static int look_below_init(struct tree *tree, struct avc_error *err)
 	pid_t children[CHILDREN_MAX];
 	const int count = proc_children(tree->init, children, CHILDREN_MAX);
 
+	if (count < 0)
+		return not_listed(tree->init, err);
 	for (int i = 0; i < count; i++) {
 		const int none = is_none(tree, children[i], err);
 
@@ -260,7 +274,7 @@ static struct process *add_process(struct tree *tree, pid_t pid, uint64_t start,
 	if (make_room(&tree->process, tree->processes, &tree->process_room, sizeof *tree->process))
 		process = process_new(tree);
 	if (!process) {
-		fail_errno(err, pid, "look at processes", "malloc", "out of memory");
+		fail_memory(err, pid, "look at processes");
 		return NULL;
 	}
 	if (process_open(process, pid, proc_inside(pid), err)) {
@@ -382,6 +396,9 @@ static int look_at_entry(struct tree *tree, struct tree_entry *entry, struct avc
 	struct proc_stat stat;
 
 	if (look_at(tree, entry->pid, &stat)) {
+		if (is_shortage(errno))
+			return fail_errno(err, entry->pid, "look at processes", "open(stat)",
+					  "it cannot be seen");
 		entry->pid = 0; /* it has just been reaped */
 		return 0;
 	}

@@ -53,7 +53,7 @@ struct copier *copier_new(struct avc_error *err)
 		copier->buffer[0] = malloc(BUFFER_BYTES);
 	if (!copier || !copier->buffer[0]) {
 		free(copier);
-		fail_errno(err, 0, "restore memory", "malloc", "out of memory");
+		fail_memory(err, 0, "restore memory");
 		return NULL;
 	}
 	pthread_mutex_init(&copier->lock, NULL);
@@ -148,7 +148,7 @@ int copier_open(struct copier *copier, pid_t template, pid_t pid, struct avc_err
 	pthread_mutex_lock(&copier->lock);
 	if (!result && !make_room(&copier->source, copier->sources, &copier->sources_room,
 				  sizeof *copier->source))
-		result = fail_errno(err, 0, "restore memory", "realloc", "out of memory");
+		result = fail_memory(err, 0, "restore memory");
 	if (!result)
 		copier->source[copier->sources++] = source;
 	pthread_mutex_unlock(&copier->lock);
@@ -168,7 +168,7 @@ static int add_chunks(struct copier *copier, avc_remote start, avc_remote end,
 
 		if (!make_room(&copier->chunk, copier->chunks, &copier->chunks_room,
 			       sizeof *copier->chunk))
-			return fail_errno(err, 0, "restore memory", "realloc", "out of memory");
+			return fail_memory(err, 0, "restore memory");
 		copier->chunk[copier->chunks++] = (struct chunk){ copier->sources - 1, start,
 								  up_to };
 		start = up_to;

@@ -411,7 +411,7 @@ static struct last_pid *start_helper(const struct generation *generation,
 	uint32_t count = 0;
 
 	if (!slot) {
-		fail_errno(err, 0, "restore", "calloc", "out of memory");
+		fail_memory(err, 0, "restore");
 		return NULL;
 	}
 	for (uint32_t i = 0; i < generation->images; i++) {

@@ -281,7 +281,7 @@ static struct keeper *add_keeper(struct restore_tree *restored, uint32_t host, p
 	if (!make_room(&restored->keeper, restored->keepers, &restored->keeper_room,
 		       sizeof *restored->keeper)) {
 		tracee_kill(pid);
-		fail_errno(err, pid, "restore", "realloc", "out of memory");
+		fail_memory(err, pid, "restore");
 		return NULL;
 	}
 	keeper = &restored->keeper[restored->keepers++];

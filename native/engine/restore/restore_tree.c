@@ -31,7 +31,7 @@ struct restore_tree *restore_tree_new(struct restore *restore, struct avc_error 
 		calloc(1, sizeof *restored + generation->images * sizeof *restored->forked);
 
 	if (!restored) {
-		fail_errno(err, 0, "restore", "calloc", "out of memory");
+		fail_memory(err, 0, "restore");
 		return NULL;
 	}
 	restored->restore = restore;

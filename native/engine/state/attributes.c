@@ -388,7 +388,7 @@ int attributes_keep(struct image *image, struct avc_error *err)
 
 	image->attributes = kept;
 	if (!kept)
-		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
+		return fail_memory(err, 0, "keep template");
 	/* It may be dying: what is restored must not stay the OOM killer's first choice. */
 	if (proc_read(process->pid, "oom_score_adj", kept->oom_score_adj,
 		      sizeof kept->oom_score_adj) <= 0 &&

@@ -314,7 +314,7 @@ int filters_setup(struct image *image, const struct thread *main_thread, struct 
 
 	image->seal = calloc(process->thread_count, sizeof *image->seal);
 	if (!image->seal)
-		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
+		return fail_memory(err, 0, "keep template");
 	image->seals = 0;
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		const struct thread *t = &process->threads[i];

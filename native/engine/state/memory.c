@@ -190,7 +190,7 @@ static int see(struct mem_seen *seen, struct area *a, uint64_t limit, struct avc
 	a->again = mem_seen_has(seen, a);
 	a->left = !a->again && seen->shared_bytes + area_bytes(a) > limit;
 	if (!a->again && !a->left && !mem_seen_add(seen, a))
-		return fail_errno(err, 0, "keep memory", "calloc", "out of memory");
+		return fail_memory(err, 0, "keep memory");
 	return 0;
 }
 
@@ -218,7 +218,7 @@ int memory_prepare(const struct process *process, struct mem_image **image, stru
 	}
 	*image = malloc(sizeof **image + bytes);
 	if (!*image)
-		return fail_errno(err, 0, "keep memory", "malloc", "out of memory");
+		return fail_memory(err, 0, "keep memory");
 	/* Touch all of it: page faults now, not in the freeze. */
 	memset(*image, 0, sizeof **image + bytes);
 	(*image)->whole = true;
@@ -226,7 +226,7 @@ int memory_prepare(const struct process *process, struct mem_image **image, stru
 	(*image)->bytes = bytes;
 	(*image)->left_bytes = left_bytes;
 	if (!areas_copy(&(*image)->areas, areas))
-		return fail_errno(err, 0, "keep memory", "malloc", "out of memory");
+		return fail_memory(err, 0, "keep memory");
 	return 0;
 }
 
@@ -359,7 +359,7 @@ static int look_for_dontfork(struct process *process, struct dontfork *look, str
 	if (!memory->unforked_at)
 		memory->unforked_at = calloc(DONTFORK_MAX, sizeof *memory->unforked_at);
 	if (!memory->unforked_at)
-		return fail_errno(err, process->pid, "look at memory", "calloc", "out of memory");
+		return fail_memory(err, process->pid, "look at memory");
 	if (proc_mappings(process->pid, "smaps", find_dontfork, look))
 		return fail_errno(err, process->pid, "look at memory", "read(smaps)",
 				  "it has ended");

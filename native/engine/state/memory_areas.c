@@ -404,7 +404,7 @@ static int read_areas(struct survey *survey, const struct areas *copied, struct 
 	memory->unkept = survey->unkept;
 	survey->unkept = (struct areas){ 0 };
 	if (survey->lost_some)
-		return fail_errno(err, 0, "keep memory", "realloc", "out of memory");
+		return fail_memory(err, 0, "keep memory");
 	if (survey->refused)
 		result = fail(err, AVC_UNSUPPORTED, 0, pid, "keep memory", "", "%s",
 			      survey->refused);
@@ -570,7 +570,7 @@ int memory_check_unkept(const struct image *image, uint32_t images, struct avc_e
 		if (image[i].process)
 			added = add_unkept(&list, image[i].process, image[i].memory);
 	if (!added) {
-		result = fail_errno(err, 0, "keep memory", "realloc", "out of memory");
+		result = fail_memory(err, 0, "keep memory");
 	} else if (list.count) {
 		qsort(list.item, list.count, sizeof *list.item, compare_unkept);
 		common = find_common(&list);

@@ -171,7 +171,7 @@ int process_attrs_learn(struct image *image, struct avc_error *err)
 
 	image->attrs = attrs;
 	if (!attrs)
-		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
+		return fail_memory(err, 0, "keep template");
 	for (int i = 0; i < SIGNALS; i++)
 		list[n++] = (struct inj_syscall){
 			.nr = SYS_rt_sigaction,

@@ -171,6 +171,8 @@ int init_channel_open(struct init_channel *channel, struct avc_error *err)
 	uint64_t magic = 0;
 
 	channel->init = proc_pidfd_pid(pidfd);
+	if (channel->init < 0 && is_shortage(errno))
+		return fail_errno(err, 0, "attach", "open(fdinfo)", "it cannot be seen");
 	if (channel->init <= 0)
 		return fail(err, AVC_GONE, ESRCH, 0, "attach", "",
 			    "the container's main process has ended");
@@ -341,10 +343,13 @@ int init_channel_kill_leftovers(struct init_channel *channel,
 	/* The children of a killed process become init's in turn. */
 	for (;;) {
 		pid_t children[CHILDREN_MAX];
-		const int count = proc_children(channel->init, children, CHILDREN_MAX);
 		const uint64_t now = now_ns();
+		const int count = proc_children(channel->init, children, CHILDREN_MAX);
 		bool any = false;
 
+		if (count < 0 && is_shortage(errno))
+			return fail_errno(err, 0, "restore", "open(children)",
+					  "its processes cannot be listed");
 		alive = 0;
 		for (int i = 0; i < count; i++) {
 			const int runs = keep(children[i], arg)

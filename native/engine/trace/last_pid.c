@@ -106,6 +106,13 @@ become(void *arg)
 	for (int i = 0; i < LASTPID_FDS; i++)
 		high[i] = raw_syscall(SYS_fcntl, (uint64_t)birth->fd[i], F_DUPFD_CLOEXEC, HIGH_FD,
 				      0, 0, 0);
+	/* The kernel also says EINVAL where the limit is below. */
+	birth->error = program < 0 ? EMFILE : 0;
+	for (int i = 0; i < LASTPID_FDS; i++)
+		if (high[i] < 0)
+			birth->error = EMFILE;
+	if (birth->error)
+		return 1;
 	for (int i = 0; i < LASTPID_FDS; i++)
 		raw_syscall(SYS_dup3, (uint64_t)high[i], (uint64_t)i, 0, 0, 0, 0);
 	raw_syscall(SYS_dup3, (uint64_t)program, LASTPID_FDS, O_CLOEXEC, 0, 0, 0);
@@ -245,7 +252,7 @@ static struct last_pid *helper_new(int init_pidfd, struct avc_error *err)
 		birth = NULL;
 	if (!birth) {
 		free(helper);
-		fail_errno(err, 0, "restore", "calloc", "out of memory");
+		fail_memory(err, 0, "restore");
 		return NULL;
 	}
 	memset(birth, 0, offsetof(struct birth, stack));
@@ -337,7 +344,7 @@ struct last_pid *last_pid_start(int init_pidfd, const struct last_pid_slot *slot
 		return NULL;
 	helper->slot = calloc(count, sizeof(struct inj_slot *));
 	if (!helper->slot)
-		result = fail_errno(err, 0, "restore", "calloc", "out of memory");
+		result = fail_memory(err, 0, "restore");
 	lend_priority(helper);
 	for (uint32_t i = 0; !result && i < count; i += LASTPID_MESSAGE_SLOTS) {
 		const uint32_t left = count - i;

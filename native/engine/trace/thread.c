@@ -43,7 +43,7 @@ static int more_room(struct process *process, pid_t tid, struct avc_error *err)
 		return fail(err, AVC_DEADLINE, 0, tid, "freeze", "",
 			    "threads appear faster than they can be stopped");
 	if (mprotect(process->threads, room * sizeof *process->threads, PROT_READ | PROT_WRITE))
-		return fail_errno(err, tid, "walk threads", "mprotect", "out of memory");
+		return fail_memory(err, tid, "walk threads");
 	process->thread_room = room;
 	return 0;
 }
@@ -86,7 +86,12 @@ static int seize_failed(pid_t pid, pid_t tid, struct avc_error *err)
 	char name[16 + 1] = "?"; /* TASK_COMM_LEN, with a line feed at its end */
 
 	if (errnum == EPERM) {
-		if (proc_status(tid, &status) || status.locked_kb < 0)
+		if (proc_status(tid, &status)) {
+			if (!is_shortage(errno))
+				errno = ESRCH;
+			return fail_errno(err, tid, "stop", "ptrace(SEIZE)", "it has ended");
+		}
+		if (status.locked_kb < 0)
 			return fail(err, AVC_GONE, errnum, tid, "stop", "ptrace(SEIZE)",
 				    "it has ended");
 		if (status.tracer) {

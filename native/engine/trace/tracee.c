@@ -139,7 +139,9 @@ static bool is_dying(pid_t tid)
 {
 	struct proc_stat stat;
 
-	return proc_stat(tid, &stat) || stat.state == 'Z' || stat.state == 'X';
+	if (proc_stat(tid, &stat))
+		return !is_shortage(errno);
+	return stat.state == 'Z' || stat.state == 'X';
 }
 
 /* Like waitpid(2), but leaves a thread that is about to receive a signal as it is.  Waiting for

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The guard itself has no descriptors, memory or tasks left for a moment: which says nothing about the application.
+
+It is neither taken for dead nor let go of, and what the guard says is what it lacks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import resource
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from testkit.guarded import WHERE, GuardProcess, Victim, config
+
+KINDS_OF_LOSS = ("dropped", "unprotected", "gave_up")
+LEVELS = 8
+"""With so many free ones it has all that it takes."""
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+@contextlib.contextmanager
+def limited(guard: GuardProcess, what: int, limit: int) -> Iterator[None]:
+    soft, hard = resource.prlimit(guard.pid, what)
+    resource.prlimit(guard.pid, what, (limit, hard))
+    try:
+        yield
+    finally:
+        resource.prlimit(guard.pid, what, (soft, hard))
+
+
+def limit_for(guard: GuardProcess, free: int) -> int:
+    """The limit under which it can open so many more files."""
+    used = {int(number) for number in os.listdir(f"/proc/{guard.pid}/fd")}
+    return [number for number in range(len(used) + free + 1) if number not in used][free]
+
+
+def losses(guard: GuardProcess) -> list[object]:
+    return [event for event in guard.events if event.get("kind") in KINDS_OF_LOSS]
+
+
+def check_says(answer: dict[str, object], number: int, words: str) -> None:
+    error = answer["error"]
+    assert isinstance(error, dict)
+    assert (error["kind"], error["errno"]) == ("kernel", number), answer
+    assert words in error["detail"]
+
+
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("first", [True, False], ids=["first", "another"])
+def test_descriptors(first: bool, where: str, tmp_path: Path) -> None:
+    with Victim(f"idle 1 2 {where}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        guard.wait("attached")
+        if not first:
+            assert guard.checkpoint()["kind"] == "checkpoint"
+        missed = 0
+        for free in range(LEVELS):
+            with limited(guard, resource.RLIMIT_NOFILE, limit_for(guard, free)):
+                answer = guard.command("checkpoint")
+            if answer["kind"] == "missed" and answer["error"]["kind"] != "deadline":
+                check_says(answer, errno.EMFILE, "its guard may not open any more files")
+                missed += 1
+        assert missed
+        assert not losses(guard)
+        assert guard.checkpoint()["kind"] == "checkpoint"
+        victim.wait_beats()
+
+
+def test_memory(tmp_path: Path) -> None:
+    with Victim("threads 4 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        guard.wait("attached")
+        with limited(guard, resource.RLIMIT_AS, 1):
+            answer = guard.command("checkpoint")
+        check_says(answer, errno.ENOMEM, "its guard gets no more memory")
+        assert not losses(guard)
+        assert guard.checkpoint()["kind"] == "checkpoint"
+        victim.wait_beats()
