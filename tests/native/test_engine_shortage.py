@@ -10,6 +10,7 @@ import contextlib
 import errno
 import os
 import resource
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,6 +19,9 @@ import pytest
 from testkit.guarded import WHERE, GuardProcess, Victim, config
 
 KINDS_OF_LOSS = ("dropped", "unprotected", "gave_up")
+MOMENT_S = 0.1
+FEW = 16
+"""So many can be waited for, poll(2), and it has more open."""
 LEVELS = 8
 """With so many free ones it has all that it takes."""
 
@@ -83,3 +87,28 @@ def test_memory(tmp_path: Path) -> None:
         assert not losses(guard)
         assert guard.checkpoint()["kind"] == "checkpoint"
         victim.wait_beats()
+
+
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("limit", [1, FEW])
+def test_a_death_while_there_are_no_descriptors(limit: int, where: str, tmp_path: Path) -> None:
+    with Victim(f"idle 1 2 {where}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        taken = guard.checkpoint()
+        with limited(guard, resource.RLIMIT_NOFILE, limit):
+            victim.kill_app()
+            time.sleep(MOMENT_S)
+        event = guard.wait_for(lambda event: event.get("kind") in ("restored", "gave_up"), "end of the restore")
+        assert event["kind"] == "restored", event
+        assert event["generation"] == taken["generation"]
+        assert not losses(guard)
+        victim.wait_beats()
+        assert guard.checkpoint()["kind"] == "checkpoint"
+
+
+def test_there_are_none_for_long(tmp_path: Path) -> None:
+    """The application cannot be brought back, and who waits for its end is not kept waiting."""
+    with Victim("idle 1 2", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        guard.checkpoint()
+        with limited(guard, resource.RLIMIT_NOFILE, FEW):
+            victim.kill_app()
+            check_says(guard.wait("gave_up"), errno.EMFILE, "its guard may not open any more files")

@@ -333,6 +333,15 @@ def test_another_program_is_not_refused_yet() -> None:
 # --- which deaths are undone ----------------------------------------------------
 
 
+def test_how_long_a_restore_waits_for_room() -> None:
+    """For what the guard itself lacks, descriptors or memory: init is not kept waiting for long."""
+    guard = Guarded()
+    died = guard.now
+    assert guard.c.policy_awaits_room(died, died)
+    assert guard.c.policy_awaits_room(died, died + SECOND - 1)
+    assert not guard.c.policy_awaits_room(died, died + SECOND)
+
+
 def judged(status: int, on: Sequence[int | str], stop_asked: bool = False, asked: str = "NONE") -> tuple[bool, str]:
     guard = Guarded()
     guard.config.restore_on_signal = "signal" in on

@@ -14,6 +14,7 @@
 #define HOLDER_NS (1 * NS_PER_S) /* busy machines */
 #define INIT_LOOK_NS (50 * NS_PER_MS)
 #define ENDS_NS (20 * NS_PER_MS)
+#define ROOM_STEP_US 10000
 
 /* ---- death and restore --------------------------------------------------------- */
 
@@ -291,6 +292,17 @@ static void prepare_next_try(struct avc_guard *guard, bool again, const struct a
 	guard_kill_lost(guard);
 }
 
+/* It has failed for want of our own descriptors or memory, not the container's (AVC_LIMIT).  True: to be
+ * tried again. */
+static bool await_room(const struct avc_report *report, const struct avc_error *failed)
+{
+	if (failed->code != AVC_KERNEL || !is_shortage(failed->errnum) ||
+	    !policy_awaits_room(report->reaped_ns, now_ns()))
+		return false;
+	usleep(ROOM_STEP_US);
+	return budget_wait();
+}
+
 static struct avc_event restored_event(const struct avc_guard *guard,
 				       const struct avc_report *report, enum avc_reason reason)
 {
@@ -367,7 +379,7 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 			guard_kill_lost(guard);
 			break;
 		}
-		again = whole && !again;
+		again = whole && (!again || (!together && await_room(report, &failed)));
 		if (!again && !error->code)
 			*error = failed;
 		prepare_next_try(guard, again, &failed);
@@ -493,6 +505,18 @@ static bool fall_back(struct avc_guard *guard, const struct avc_report *report,
 	return false;
 }
 
+/* Nothing of it may be left. */
+static int end_leftovers(struct avc_guard *guard, const struct avc_report *report,
+			 struct avc_error *err)
+{
+	while (init_channel_kill_leftovers(&guard->channel, guard_owns, reap_tracees, guard, err)) {
+		if (!await_room(report, err))
+			return -1;
+		*err = (struct avc_error){ 0 };
+	}
+	return 0;
+}
+
 /* `had`: how many generations there were at the death. */
 static void restore_dead(struct avc_guard *guard, const struct avc_report *report,
 			 enum avc_reason reason, uint32_t had)
@@ -505,7 +529,7 @@ static void restore_dead(struct avc_guard *guard, const struct avc_report *repor
 	ready_helper(guard);
 	kill_descendants(guard);
 	await_killed_holder(guard);
-	if (init_channel_kill_leftovers(&guard->channel, guard_owns, reap_tracees, guard, &error)) {
+	if (end_leftovers(guard, report, &error)) {
 		guard_give_up(guard, report, AVC_REASON_FAILED, &error);
 	} else if (!guard->count) {
 		fail(&error, AVC_EMPTY, 0, 0, "restore", "", "no generation is held");

@@ -19,6 +19,7 @@
 #define WRITES_NS (3000 * MS)
 #define PROOF_NS (1000 * MS) /* an app that lives this long has made progress */
 #define AGAIN_NS (50 * MS)
+#define ROOM_NS (1000 * MS)
 #define AVERAGE_OF 8
 #define SAMPLES 3
 #define FORKS 64
@@ -572,6 +573,11 @@ void policy_restored(struct policy *policy, uint32_t i, bool crashed, uint64_t n
 		return;
 	policy->restored_ns = now;
 	policy->restored_at[policy->restores++ % AVC_RESTORES_MAX] = now;
+}
+
+bool policy_awaits_room(uint64_t died_ns, uint64_t now)
+{
+	return now < died_ns + ROOM_NS;
 }
 
 uint32_t policy_restores_within(const struct policy *policy, const struct avc_config *config,

@@ -216,6 +216,10 @@ struct policy_fallback policy_crashed(struct policy *policy, const struct avc_co
 /* held[i] runs again.  `crashed`: not on command. */
 void policy_restored(struct policy *policy, uint32_t i, bool crashed, uint64_t now);
 
+/* A restore of what died at `died_ns` has failed because we had no descriptors or memory left: whether
+ * to wait until there may be some again.  Whoever took them may need them for a moment only. */
+bool policy_awaits_room(uint64_t died_ns, uint64_t now);
+
 /* The number of restores after a crash that count now. */
 uint32_t policy_restores_within(const struct policy *policy, const struct avc_config *config,
 				uint64_t now);
