@@ -9,6 +9,7 @@ JSON on standard output.  Commands are lines on standard input:
     checkpoint COOKIE TICKET       restore COOKIE TICKET      with a time in s behind it: not later
     burst COOKIE TICKET N          N checkpoints back to back; one line {"burst": TICKET, ...} at the end
     check COOKIE MS                kills a guard that has not been heard of for so long
+    tasks COOKIE LIMIT             its container may have so many, from now on
     start COOKIE PID               another guard in place of that one, for the application below that init
     stop                           stops the guards and ends
 
@@ -18,6 +19,7 @@ The end of the input ends it as `stop` does.  AVCKPT_TEST_GUARD names another av
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import select
@@ -120,6 +122,10 @@ class Peer:
         cookie, ticket = int(words[1]), int(words[2])
         if words[0] == "check":
             self.guards[cookie].check(ticket / 1000)
+            return
+        if words[0] == "tasks":
+            self.config = dataclasses.replace(self.config, tasks_max=ticket)
+            self.guards[cookie].configure(self.config)
             return
         if words[0] == "start":
             self.start_another(cookie, int(words[2]))

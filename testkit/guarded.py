@@ -208,6 +208,10 @@ class GuardProcess:
         """The memory of the dead, a `remains_pid` or `likeness_pid`, has been looked at."""
         self._say(f"seen {cookie} {pid}")
 
+    def say_tasks(self, limit: int, cookie: int = 1) -> None:
+        """The limit of its container's tasks has changed (`podman update --pids-limit`)."""
+        self._say(f"tasks {cookie} {limit}")
+
     def burst(self, n: int, cookie: int = 1, timeout_s: float = 110.0) -> Json:
         """`n` checkpoints back to back."""
         self.wait("attached", cookie=cookie)

@@ -277,6 +277,18 @@ def test_there_is_no_room_for_copies_of_a_big_parent() -> None:
         assert not [event for event in guard.events if event.get("kind") == "dropped"]
 
 
+def test_there_is_room_for_one_again(tmp_path: Path) -> None:
+    """Its container may have more tasks: before, there was room for a holder and templates only."""
+    forks = config(images=Images.FORK, keep=1, tasks_max=7)
+    with Victim("idle 0 4", tmp_path) as victim, GuardProcess(forks, [victim.pid]) as guard:
+        assert guard.checkpoint()["kind"] == "checkpoint"
+        time.sleep(0.1)
+        assert not spares(victim)
+        guard.say_tasks(100)
+        assert guard.checkpoint()["kind"] == "checkpoint"
+        wait_spare(victim)
+
+
 def policies(victim: Victim, name: str) -> set[int]:
     found = set()
     for pid in ours(victim, name):

@@ -31,9 +31,11 @@ void guard_take_config(struct avc_guard *guard, const struct avc_config *config)
 	while (guard->count > guard->policy.room)
 		guard_drop_generation(guard, policy_dispensable(&guard->policy));
 	guard_rank_generations(guard);
-	/* It may not have to be refused any more. */
-	if (config->tasks_max != tasks_max)
+	/* It may not have to be refused any more, and there may be room for spares. */
+	if (config->tasks_max != tasks_max) {
 		policy_retry(&guard->policy);
+		guard->cramped = false;
+	}
 	if (guard->attached)
 		guard->next_ns = policy_due_again(config, guard->next_ns, now_ns());
 }
