@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from testkit.guarded import WHERE, GuardProcess, Victim, config, kill_at_random
+from testkit.harness import wait_until
 
 pytestmark = pytest.mark.shared_machine(
     "init waits two seconds for its guard, which may get no CPU for as long; deadlines are compared with the clock"
@@ -31,6 +32,10 @@ def built(init_built: None, victims_built: Path) -> None:
 def test_timers(command: str, where: str, tmp_path: Path) -> None:
     with Victim(f"{command} {where}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 60, (0.005, 0.1))
+        if command != "timers":
+            rung = victim.see().counter[0]
+            wait_until(lambda: victim.see().counter[0] > rung + 2, 10, "they ring on")
+            victim.check()
 
 
 @pytest.mark.parametrize("where", WHERE)
