@@ -103,20 +103,28 @@ static struct policy_run app_run(struct avc_guard *guard)
 				    .waited_ns = since(now.waited_ns, before.waited_ns) };
 }
 
-/* The same with a fixed interval, and for no more than all that was cloned. */
+#define FEW 8 /* writes to all pages together take less than such a part of the interval */
+
+/* The same with a fixed interval, and for no more than all that was cloned.  Most applications are too
+ * small for that to matter, however long they wait for a CPU: they are spared the looks. */
 static uint64_t writes_ns(struct avc_guard *guard)
 {
 	/* 0: somebody has killed its templates already. */
 	const struct generation *newest = guard->count ? &guard->generations[guard->count - 1]
 						       : NULL;
-	const struct policy_run run = app_run(guard);
-	uint64_t faults = faults_since(guard), pages = 0;
+	struct policy_run run;
+	uint64_t faults, pages = 0;
 
 	for (uint32_t i = 0; newest && i < newest->images; i++)
 		pages += (uint64_t)newest->image[i].anon_pages;
-	if (faults > pages)
-		faults = pages;
-	return policy_writes(faults * first_write_ns(), &run);
+	if (FEW * pages * first_write_ns() < guard->config.interval_ns) {
+		guard->ran = (struct policy_run){ 0 };
+		guard->pace_faults = 0;
+		return 0;
+	}
+	run = app_run(guard);
+	faults = faults_since(guard);
+	return policy_writes((faults < pages ? faults : pages) * first_write_ns(), &run);
 }
 
 enum avc_fork_reason guard_why_fork(struct avc_guard *guard)
