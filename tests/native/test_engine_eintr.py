@@ -138,14 +138,15 @@ def test_threads_wait_for_a_slow_guard_while_they_are_restored(tmp_path: Path) -
         victim.wait_beats()
 
 
-@pytest.mark.parametrize("interval_s", [0.1, 1.0])
+@pytest.mark.parametrize("interval_s", [0.3, 1.0])
 @pytest.mark.parametrize("elsewhere", [False, True], ids=["", "woken elsewhere"])
 def test_the_wait_before_the_first_stop_counts(elsewhere: bool, interval_s: float, tmp_path: Path) -> None:
     """The time that a call had waited before it was stopped is subtracted: it ends when it would have ended.
 
-    Holds for every call on an idle machine; on a busy one a call in four may wait for the guard.
+    Holds for every call on an idle machine; on a busy one half of them may wait for the guard, or for a CPU.
+    Not subtracted, it is 0.1 s and more.
     """
-    seconds, n = 0.25, 12
+    seconds, n = 0.5, 9
     late = []
     command = f"eintr epoll_wait {seconds} --quiet"
     with Victim(command, tmp_path) as victim, GuardProcess(config(interval_s), [victim.pid]) as guard:
@@ -160,4 +161,4 @@ def test_the_wait_before_the_first_stop_counts(elsewhere: bool, interval_s: floa
             guard.wait("checkpoint", since=guard.mark())
             victim.wait_beats(1)  # the call that was stopped ends
             late.append(victim.see().counter[LONGEST] / 1e9 - seconds)
-    assert sorted(late)[n * 3 // 4] < 0.04 * SLOWNESS, late
+    assert sorted(late)[n // 2] < 0.08 * SLOWNESS, late
