@@ -92,10 +92,5 @@ def starttime(pid: int) -> int:
 
 
 def write_record(registration: protocol.Register) -> None:
-    """Writes the container's record, at once or not at all.
-
-    With the PID namespace that its PID is of: a sidecar without --pid=host is in
-    another one, and must not take the container for one that has ended.
-    """
-    record = {**registration.record(), "pid_namespace": os.stat("/proc/self/ns/pid").st_ino}
-    files.write_private(protocol.record_path(registration.id), json.dumps(record).encode() + b"\n")
+    """Writes the container's record, at once or not at all."""
+    files.write_private(protocol.record_path(registration.id), registration.to_record())

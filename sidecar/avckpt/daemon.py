@@ -38,7 +38,7 @@ from avckpt.containers.names import Names
 from avckpt.containers.presence import Presence
 from avckpt.containers.process import has_ended, is_foreign, pid_of
 from avckpt.containers.protected import Protected, State
-from avckpt.containers.records import NOT_SEEN, Records, keep_private
+from avckpt.containers.records import NOT_SEEN, Records, keep_hooks_folders
 from avckpt.containers.registry import Registry
 from avckpt.containers.strangers import let_go
 from avckpt.engine import Engine, Guard
@@ -405,12 +405,10 @@ class Daemon:
                 self.run_dir.mkdir(mode=0o755, parents=True, exist_ok=True)
                 self._lock.take()
                 log.warning("%s was emptied: it is made again", self.run_dir)
-                for name in ("containers", "health"):
-                    keep_private(self.run_dir / name)
+                keep_hooks_folders(self.run_dir)
                 self.history.write_again()
             for listener in self._listeners:
-                made = listener.keep()
-                if made if isinstance(made, bool) else await made:
+                if await listener.keep():
                     log.warning("a socket in %s was removed or replaced: it is made again", self.run_dir)
         except Busy as error:
             problem = f"{self.run_dir} was emptied: {error}"

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from avckpt.containers import cgroup
-from avckpt.containers.records import keep_private
+from avckpt.containers.records import keep_hooks_folders
 from avckpt.daemon import Daemon
 from avckpt.engine import probe
 from avckpt.errors import AvckptError, Busy, Denied
@@ -61,8 +61,7 @@ def serve(run_dir: Path, config_path: Path, beat_fd: int = -1) -> None:
     try:
         run_dir.mkdir(mode=0o755, parents=True, exist_ok=True)
         with only_one(run_dir) as lock:
-            for name in ("containers", "health"):
-                keep_private(run_dir / name)
+            keep_hooks_folders(run_dir)
             asyncio.run(Daemon(run_dir, config_path, beat_fd, lock).run())
     except OSError as error:
         kind = Denied if isinstance(error, PermissionError) else AvckptError

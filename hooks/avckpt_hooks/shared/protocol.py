@@ -141,6 +141,15 @@ class Register:
             "annotations": self.annotations,
         }
 
+    def to_record(self) -> bytes:
+        """What the container's record says.
+
+        With the PID namespace that its PID is of, which is ours: a sidecar without --pid=host is in
+        another one, and must not take the container for one that has ended.
+        """
+        record = {**self.record(), "pid_namespace": os.stat("/proc/self/ns/pid").st_ino}
+        return json.dumps(record).encode() + b"\n"
+
     def encode(self) -> bytes:
         """The packet.  Raises ProtocolError when it is longer than MAX_BYTES."""
         return _encode({"op": "register", **self.record()})

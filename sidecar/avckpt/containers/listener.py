@@ -65,7 +65,7 @@ class HookListener:
         """The last accept failed, which has been logged."""
         self._listen()
 
-    def keep(self) -> bool:
+    async def keep(self) -> bool:
         """Makes the socket again if its file was removed or replaced; whether it was.  Raises OSError."""
         if identity(self._path) == self._file:
             return False

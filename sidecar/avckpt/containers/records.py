@@ -8,6 +8,7 @@ import json
 import logging
 import os
 from collections.abc import Callable, Iterator
+from copy import copy
 from pathlib import Path
 
 from avckpt_hooks.shared.files import make_private, read_own, write_private
@@ -35,6 +36,12 @@ def keep_private(directory: Path) -> None:
     for path in directory.iterdir():
         with contextlib.suppress(FileNotFoundError):  # its container has just stopped
             path.chmod(0o600)
+
+
+def keep_hooks_folders(run_dir: Path) -> None:
+    """Those that hooks write to.  Raises OSError."""
+    for name in ("containers", "health"):
+        keep_private(run_dir / name)
 
 
 class Records:
@@ -82,9 +89,9 @@ class Records:
     def write(self, request: Register, init_pid: int) -> None:
         """Does what the hook could not do, or what somebody has removed, for a container that lives.  Raises
         OSError."""
-        record = {**request.record(), "pid": init_pid, "pid_namespace": OWN_NAMESPACE}
-        path = self._directory.joinpath(f"{request.id}.json")
-        write_private(str(path), json.dumps(record).encode() + b"\n")
+        ours = copy(request)
+        ours.pid = init_pid
+        write_private(str(self._directory.joinpath(f"{request.id}.json")), ours.to_record())
 
     def has(self, container_id: str) -> bool:
         """Whether there is a record of that container."""

@@ -290,7 +290,7 @@ class UnitListener:
         """By connection: where what it said will be."""
         self._listen()
 
-    def keep(self) -> bool:
+    async def keep(self) -> bool:
         """Makes the socket again if its file was removed or replaced; whether it was.  Raises OSError."""
         if identity(self._path) == self._file:
             return False
