@@ -76,6 +76,9 @@ int fail_memory(struct avc_error *err, pid_t pid, const char *operation);
 bool is_shortage(int errnum);
 uint64_t now_ns(void);
 struct timespec timespec_of(uint64_t ns);
+uint64_t timespec_ns(const struct timespec *t);
+/* 0 if the clock cannot be read. */
+uint64_t clock_ns(clockid_t clock);
 void close_fd(int *fd);
 /* Like poll(2), and for as long although a signal comes: the timer of a deadline (trace.h) ticks
  * meanwhile, and with one pending poll(2) fails even if it is not to wait (fs/select.c, do_poll()). */

@@ -88,10 +88,19 @@ int fail_errno(struct avc_error *err, pid_t pid, const char *operation, const ch
 
 uint64_t now_ns(void)
 {
+	return clock_ns(CLOCK_MONOTONIC);
+}
+
+uint64_t clock_ns(clockid_t clock)
+{
 	struct timespec t;
 
-	clock_gettime(CLOCK_MONOTONIC, &t);
-	return (uint64_t)t.tv_sec * NS_PER_S + (uint64_t)t.tv_nsec;
+	return clock_gettime(clock, &t) ? 0 : timespec_ns(&t);
+}
+
+uint64_t timespec_ns(const struct timespec *t)
+{
+	return (uint64_t)t->tv_sec * NS_PER_S + (uint64_t)t->tv_nsec;
 }
 
 struct timespec timespec_of(uint64_t ns)

@@ -178,12 +178,9 @@ int proc_stat(pid_t pid, struct proc_stat *stat)
 /* pthread_getcpuclockid(3): readable for any process. */
 uint64_t proc_cpu_ns(pid_t pid)
 {
-	struct timespec used;
 	clockid_t clock;
 
-	if (clock_getcpuclockid(pid, &clock) || clock_gettime(clock, &used))
-		return 0;
-	return (uint64_t)used.tv_sec * NS_PER_S + (uint64_t)used.tv_nsec;
+	return clock_getcpuclockid(pid, &clock) ? 0 : clock_ns(clock);
 }
 
 int proc_stat_of(int stat_fd, struct proc_stat *stat)

@@ -31,19 +31,11 @@ static __thread struct {
 	uint64_t ran_ns;
 } before;
 
-static uint64_t ran_ns(void)
-{
-	struct timespec ran = { 0 };
-
-	clock_gettime(CLOCK_THREAD_CPUTIME_ID, &ran);
-	return (uint64_t)ran.tv_sec * NS_PER_S + (uint64_t)ran.tv_nsec;
-}
-
 static void count_from_now(void)
 {
 	before.spent = false;
 	before.end_ns = now_ns() + MOST_NS;
-	before.ran_ns = ran_ns();
+	before.ran_ns = clock_ns(CLOCK_THREAD_CPUTIME_ID);
 }
 
 void rt_priority_begin(void)
@@ -76,7 +68,7 @@ void rt_priority_step(void)
 	now = now_ns();
 	if (now < before.end_ns)
 		return;
-	ran = ran_ns() - before.ran_ns;
+	ran = clock_ns(CLOCK_THREAD_CPUTIME_ID) - before.ran_ns;
 	if (ran < MOST_NS) {
 		before.end_ns = now + MOST_NS - ran;
 		return;

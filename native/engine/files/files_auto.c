@@ -44,11 +44,6 @@ static bool is_data(const struct file *f)
 	return true;
 }
 
-static uint64_t real_ns(const struct timespec *t)
-{
-	return (uint64_t)t->tv_sec * NS_PER_S + (uint64_t)t->tv_nsec;
-}
-
 static int is_mapping_of(const struct mapping *m, void *arg)
 {
 	const struct file *w = arg;
@@ -69,8 +64,8 @@ static bool is_in_the_way(const struct image *image, const struct file *w, const
 			  int64_t offset)
 {
 	const bool output = (w->flags & O_ACCMODE) == O_WRONLY;
-	const uint64_t modified = real_ns(&w->modified);
-	const bool changed = st->st_size != w->bytes || real_ns(&st->st_mtim) != modified ||
+	const uint64_t modified = timespec_ns(&w->modified);
+	const bool changed = st->st_size != w->bytes || timespec_ns(&st->st_mtim) != modified ||
 			     modified + TICK_NS > image->files->taken_ns;
 
 	if (w->flags & O_APPEND || (output && !w->lock_count))
@@ -151,15 +146,14 @@ bool files_is_database(const struct process *process)
 /* The time of day may have been another one when it was created, even a later one than now. */
 static bool is_born_since(const struct files *files, int fd)
 {
-	struct timespec now;
 	struct statx born;
 	uint64_t born_ns;
 
 	if (!fd_look(fd, STATX_BTIME, &born) || !(born.stx_mask & STATX_BTIME))
 		return false;
-	clock_gettime(CLOCK_REALTIME, &now);
 	born_ns = (uint64_t)born.stx_btime.tv_sec * NS_PER_S + born.stx_btime.tv_nsec;
-	return born_ns > files->taken_ns && born_ns <= real_ns(&now) && !files_clock_was_set(files);
+	return born_ns > files->taken_ns && born_ns <= clock_ns(CLOCK_REALTIME) &&
+	       !files_clock_was_set(files);
 }
 
 bool files_is_older(const struct image *image, int fd, const struct stat *st)

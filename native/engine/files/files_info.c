@@ -110,12 +110,9 @@ static uint64_t nanoseconds(const char *value)
 
 static void timer_deadline(struct file *file, uint64_t left_ns)
 {
-	struct timespec now;
+	const uint64_t now = left_ns ? clock_ns(file->clock) : 0;
 
-	file->deadline_ns = 0;
-	if (left_ns && clock_gettime(file->clock, &now) == 0)
-		file->deadline_ns = (uint64_t)now.tv_sec * NS_PER_S + (uint64_t)now.tv_nsec +
-				    left_ns;
+	file->deadline_ns = now ? now + left_ns : 0;
 }
 
 static void take_line(struct file *file, const char *key, const char *value, struct rooms *room,

@@ -203,16 +203,10 @@ static bool may_be_served(struct look *look)
 /* Both clocks at one instant: without what may have come in between the two calls. */
 static void read_clocks(uint64_t *real_ns, uint64_t *boot_ns)
 {
-	struct timespec real, before, after;
-
 	for (int i = 0; i < ASIDE_TRIES; i++) {
-		clock_gettime(CLOCK_BOOTTIME, &before);
-		clock_gettime(CLOCK_REALTIME, &real);
-		clock_gettime(CLOCK_BOOTTIME, &after);
-		*real_ns = (uint64_t)real.tv_sec * NS_PER_S + (uint64_t)real.tv_nsec;
-		*boot_ns = (uint64_t)before.tv_sec * NS_PER_S + (uint64_t)before.tv_nsec;
-		if ((uint64_t)after.tv_sec * NS_PER_S + (uint64_t)after.tv_nsec <
-		    *boot_ns + ASIDE_NS)
+		*boot_ns = clock_ns(CLOCK_BOOTTIME);
+		*real_ns = clock_ns(CLOCK_REALTIME);
+		if (clock_ns(CLOCK_BOOTTIME) < *boot_ns + ASIDE_NS)
 			break;
 	}
 }

@@ -670,13 +670,12 @@ static const char *put_timer(int fd, const struct file *want)
 {
 	const uint64_t set_ticks_of = want->ticks && !stands_still(want) ? want->ticks : 0;
 	int flags = want->settime_flags & (TFD_TIMER_ABSTIME | TFD_TIMER_CANCEL_ON_SET);
-	uint64_t now, next, ticks = set_ticks_of;
+	const uint64_t now = clock_ns(want->clock);
+	uint64_t next, ticks = set_ticks_of;
 	struct itimerspec t = { .it_interval = timespec_of(want->interval_ns) };
-	struct timespec clock;
 
-	if (clock_gettime(want->clock, &clock))
+	if (!now)
 		return "its timer could not be set";
-	now = (uint64_t)clock.tv_sec * NS_PER_S + (uint64_t)clock.tv_nsec;
 	next = stands_still(want) ? now + 1 : next_of(want, now, &ticks);
 	t.it_value = timespec_of(next && !(flags & TFD_TIMER_ABSTIME) ? next - now : next);
 	if (timerfd_settime(fd, flags, &t, NULL))

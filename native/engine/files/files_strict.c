@@ -14,20 +14,15 @@ static bool is_data(const struct file *f)
 	       !(f->flags & O_PATH) && !f->outside && f->name && !file_is_memory(f);
 }
 
-static uint64_t real_ns(const struct timespec *t)
-{
-	return (uint64_t)t->tv_sec * NS_PER_S + (uint64_t)t->tv_nsec;
-}
-
 /* Timestamps of most kernels advance by a tick: a write in the same tick as the
  * checkpoint may not show. */
 #define TICK_NS (10 * NS_PER_MS)
 
 static bool was_written(const struct files *want, const struct file *w, const struct stat *st)
 {
-	return st->st_size != w->bytes || real_ns(&st->st_mtim) != real_ns(&w->modified) ||
-	       real_ns(&st->st_ctim) != real_ns(&w->changed) ||
-	       real_ns(&w->modified) + TICK_NS > want->taken_ns;
+	return st->st_size != w->bytes || timespec_ns(&st->st_mtim) != timespec_ns(&w->modified) ||
+	       timespec_ns(&st->st_ctim) != timespec_ns(&w->changed) ||
+	       timespec_ns(&w->modified) + TICK_NS > want->taken_ns;
 }
 
 int files_check_strict(const struct image *image, pid_t pid, int pidfd, pid_t init, pid_t holder,
@@ -68,7 +63,7 @@ int files_check_strict(const struct image *image, pid_t pid, int pidfd, pid_t in
 		const struct file *n = &now->file[i], *w = files_find(want, n->fd);
 
 		if (is_data(n) && !(w && files_same_object(w, n)) &&
-		    (real_ns(&n->modified) + TICK_NS > want->taken_ns ||
+		    (timespec_ns(&n->modified) + TICK_NS > want->taken_ns ||
 		     files_clock_was_set(want))) {
 			fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
 			     "avckpt.files=strict: %.80s was written since the checkpoint",

@@ -12,15 +12,6 @@
 #define TOLD_NS NS_PER_S
 #define SENDS_NS (10 * NS_PER_S) /* an app that has sent counts as a sender for so long      */
 
-static uint64_t own_cpu_ns(void)
-{
-	struct timespec used;
-
-	if (clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &used))
-		return 0;
-	return (uint64_t)used.tv_sec * NS_PER_S + (uint64_t)used.tv_nsec;
-}
-
 static uint64_t app_cpu_ns(const struct avc_guard *guard)
 {
 	uint64_t sum = 0;
@@ -56,13 +47,13 @@ static void begin_rest(struct avc_guard *guard)
 void guard_pace_begin(struct avc_guard *guard)
 {
 	if (policy_is_automatic(&guard->config))
-		guard->pace_began_ns = own_cpu_ns();
+		guard->pace_began_ns = clock_ns(CLOCK_PROCESS_CPUTIME_ID);
 }
 
 void guard_pace_end(struct avc_guard *guard)
 {
 	if (policy_is_automatic(&guard->config))
-		guard->pace_cpu_ns += own_cpu_ns() - guard->pace_began_ns;
+		guard->pace_cpu_ns += clock_ns(CLOCK_PROCESS_CPUTIME_ID) - guard->pace_began_ns;
 }
 
 static uint64_t faults_since(struct avc_guard *guard)

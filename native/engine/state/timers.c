@@ -123,7 +123,7 @@ void timers_answer(struct process *process, const struct inj_call *call, uint64_
 		timers->setting[i] = process->parasite.control->timer[i];
 	}
 	memcpy(&asked, &process->parasite.control->timer[CLOCK], sizeof asked);
-	timers->asked_ns = (uint64_t)asked.tv_sec * NS_PER_S + (uint64_t)asked.tv_nsec;
+	timers->asked_ns = timespec_ns(&asked);
 }
 
 /* On CPU time, which starts over with the process. */
