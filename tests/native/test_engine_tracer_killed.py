@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import os
 import re
 import shutil
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -109,3 +112,30 @@ def test_handlers_run_on_their_own_stack(tmp_path: Path) -> None:
             subprocess.run([*trace, "-p", str(guard.pid)], timeout=15, check=False, stderr=subprocess.DEVNULL)
             victim.wait_beats(10)
             guard.start_another(victim.pid)
+
+
+def test_a_lock_that_is_still_held_is_waited_for(tmp_path: Path) -> None:
+    """A helper of a guard that was killed shares its lock, until it gets a CPU to end."""
+    with Victim("idle 1 1", tmp_path) as victim:
+        path = victim.ctl_path()
+        assert path is not None
+        held = os.open(path, os.O_RDWR)
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with GuardProcess(config(0.05), [victim.pid]) as guard:
+            guard.wait("started")
+            time.sleep(0.1)
+            os.close(held)
+            guard.wait("checkpoint")
+            assert "unprotected" not in [event["kind"] for event in guard.events]
+
+
+def test_another_guard_is_told_of(tmp_path: Path) -> None:
+    with Victim("idle 1 1", tmp_path) as victim:
+        path = victim.ctl_path()
+        assert path is not None
+        held = os.open(path, os.O_RDWR)
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with GuardProcess(config(0.05), [victim.pid]) as guard:
+            guard.wait_for(lambda event: "another avckpt guards it" in str(event.get("error")), "it is told")
+            os.close(held)
+            guard.wait("checkpoint")

@@ -19,6 +19,7 @@
 #define LOOK_AGAIN_NS (20 * NS_PER_MS)   /* whether init is ready            */
 #define LOOK_SELDOM_NS (250 * NS_PER_MS) /* after LOOK_OFTEN_NS of that      */
 #define LOOK_OFTEN_NS (5 * NS_PER_S)
+#define LEFT_NS (2 * NS_PER_S) /* helpers of a guard that was killed have ended */
 #define STRAGGLER_NS (NS_PER_MS / 5)
 #define STRAGGLER_LONG_NS (20 * NS_PER_MS)
 #define LAST_WORDS_NS NS_PER_S
@@ -353,7 +354,9 @@ static void attach(struct avc_guard *guard)
 		}
 		return;
 	case -1:
-		guard_unprotect(guard, 0, &error);
+		/* Its helpers share the lock of a guard that was killed, and may wait for a CPU to end. */
+		if (error.code != AVC_BUSY || now - guard->started_ns > LEFT_NS)
+			guard_unprotect(guard, 0, &error);
 	}
 	guard->next_ns = now +
 			 (now - guard->started_ns < LOOK_OFTEN_NS ? LOOK_AGAIN_NS : LOOK_SELDOM_NS);
