@@ -15,9 +15,11 @@ from pathlib import Path
 import psutil
 import pytest
 
-from testkit.cgroups import freezer
+from testkit.cgroups import Cgroup, freezer
+from testkit.family import ours
 from testkit.guarded import BUILD, PATIENCE_S, GuardProcess, Victim, config, injected
 from testkit.harness import wait_until
+from testkit.procfs import below
 
 pytestmark = pytest.mark.shared_machine("a checkpoint that should succeed is missed where others take the CPU")
 
@@ -90,3 +92,36 @@ def test_a_restore_after_one_that_failed_late(tmp_path: Path) -> None:
         assert event["kind"] == "restored", event
         assert "error" not in event
         victim.wait_beats()
+
+
+def holders(victim: Victim) -> int:
+    return len(ours(victim, "avckpt-hold"))
+
+
+def lacks_holders_after_a_restore(pause: Cgroup, victim: Victim, guard: GuardProcess, wanted: int) -> bool:
+    """It is paused while its processes are given their new holders, one after the other, if that is soon enough."""
+    since = guard.mark()
+    victim.kill_app()
+    guard.wait("restored", since=since)
+    pause.wait()
+    time.sleep(0.2)
+    lacking = holders(victim) < wanted
+    pause.go()
+    return lacking
+
+
+def test_holders_that_a_restore_could_not_make_are_made_soon(tmp_path: Path) -> None:
+    """Until then another death loses what only the children have open, and the next checkpoint is an hour away."""
+    with freezer(1) as pause, Victim("tree 12", tmp_path) as victim:
+        for pid in (victim.pid, *below(victim.pid)):
+            pause.take(pid)
+        with GuardProcess(config(), [victim.pid]) as guard:
+            guard.checkpoint()
+            wanted = holders(victim)
+            wait_until(
+                lambda: lacks_holders_after_a_restore(pause, victim, guard, wanted),
+                PATIENCE_S,
+                "it is paused before all have their holders",
+            )
+            wait_until(lambda: holders(victim) == wanted, PATIENCE_S, "all have their holders")
+            victim.wait_beats()

@@ -416,6 +416,7 @@ static uint64_t work_due(struct avc_guard *guard)
 
 	due = earlier(due, faults_due(&guard->faults, &guard->tree, guard->next_ns));
 	due = earlier(due, guard_tell_due(guard));
+	due = earlier(due, guard->hold_ns);
 	for (uint32_t i = 0; i < guard->remains_count; i++)
 		due = earlier(due, guard->remains[i].until_ns);
 	if (guard->dead.waits)
@@ -573,6 +574,11 @@ static void work(struct avc_guard *guard)
 	guard_pace_listen(guard);
 	if (now_ns() >= guard_tell_due(guard))
 		guard_tell_untold(guard);
+	if (now_ns() >= guard->hold_ns) {
+		rt_priority_begin();
+		guard_hold_missing(guard);
+		rt_priority_end();
+	}
 	if (now_ns() >= guard->ahead_ns && tracee_ending_pidfd(0) < 0)
 		guard_work_ahead(guard);
 	if (now_ns() >= faults_due(&guard->faults, &guard->tree, guard->next_ns))
@@ -662,6 +668,7 @@ static struct avc_guard *guard_new(int socket, const struct avc_request *start, 
 	guard->socket = socket;
 	guard->cookie = start->cookie;
 	guard->policy.room = start->config.keep;
+	guard->hold_ns = UINT64_MAX;
 	guard->started_ns = now_ns();
 	guard->daemon = getppid();
 	init_channel_init(&guard->channel);

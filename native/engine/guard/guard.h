@@ -107,7 +107,9 @@ struct avc_guard {
 	bool cramped;            /* there is no room for spares              */
 	uint64_t spare_ns;       /* when the last spare was made             */
 	uint64_t ahead_ns;       /* when to guard_work_ahead(); UINT64_MAX: never  */
-	struct policy policy;    /* held[i] belongs to generations[i]        */
+	uint64_t hold_ns;        /* when to guard_hold_missing(); UINT64_MAX: never */
+	uint32_t hold_tries;
+	struct policy policy; /* held[i] belongs to generations[i]        */
 	uint32_t restores;
 	uint64_t restore_ticket;       /* of a command that has killed the app     */
 	enum avc_reason restore_asked; /* NONE: not requested                      */
@@ -338,6 +340,8 @@ void guard_give_up(struct avc_guard *guard, const struct avc_report *report, enu
 		   const struct avc_error *error);
 /* After a restore: another death soon after should cost no more than the first. */
 void guard_hold_all(struct avc_guard *guard);
+/* The same, when hold_ns has come. */
+void guard_hold_missing(struct avc_guard *guard);
 
 /* ---- guard_group.c --------------------------------------------------------- */
 

@@ -28,6 +28,7 @@
 
 static void let_go_of_holders(struct avc_guard *guard)
 {
+	guard->hold_ns = UINT64_MAX;
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		process_unhold(guard->tree.process[i]);
 }
@@ -217,13 +218,11 @@ static int renew_holders(struct avc_guard *guard, struct avc_error *err)
 static int check_vfork(const struct tree *tree, struct avc_error *err)
 {
 	const uint64_t tick_ns = NS_PER_S / (uint64_t)sysconf(_SC_CLK_TCK);
-	struct timespec now;
+	const uint64_t now = clock_ns(CLOCK_BOOTTIME);
 
-	clock_gettime(CLOCK_BOOTTIME, &now);
 	for (uint32_t i = 1; i < tree->count; i++) {
 		const struct tree_entry *entry = &tree->entry[i];
-		const uint64_t age_ns = (uint64_t)now.tv_sec * NS_PER_S + (uint64_t)now.tv_nsec -
-					entry->stat.start * tick_ns;
+		const uint64_t age_ns = now - entry->stat.start * tick_ns;
 
 		if (entry->process && !entry->process->infected && age_ns > VFORK_NS &&
 		    age_ns < INT64_MAX && tree_shares_memory(tree, i))
@@ -743,6 +742,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		miss(guard, ticket, &event, &error);
 		return;
 	}
+	guard->hold_ns = UINT64_MAX; /* all have one */
 	event.ticket = ticket;
 	event.app_pid = guard->main.leader;
 	event.app_pid_inside = guard->main.inside;

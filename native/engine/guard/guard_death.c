@@ -14,6 +14,8 @@
 #define HOLDER_NS (1 * NS_PER_S) /* busy machines */
 #define INIT_LOOK_NS (50 * NS_PER_MS)
 #define ENDS_NS (20 * NS_PER_MS)
+#define HOLD_AGAIN_NS (10 * NS_PER_MS) /* twice as long each time */
+#define HOLD_TRIES 8
 #define ROOM_STEP_US 10000
 
 /* ---- death and restore --------------------------------------------------------- */
@@ -391,21 +393,46 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 	return back;
 }
 
-/* Only holders keep open what the other processes have open. */
-void guard_hold_all(struct avc_guard *guard)
+/* False: not all of them. */
+static bool hold_all(struct avc_guard *guard)
 {
+	bool all = true;
+
 	if (!last_pid_lock(guard->channel.numbers_fd, false))
-		return;
+		return false;
 	for (uint32_t i = 0; i < guard->tree.processes; i++) {
 		struct process *process = guard->tree.process[i];
 		struct avc_error ignored = { 0 };
 
-		/* The next checkpoint tries again, and reports the error. */
-		if (process->pid && !process->adopts &&
-		    process_hold(process, guard->timer, guard->config.freeze_deadline_ns, &ignored))
+		if (process->infected && !process->adopts && !process->holder &&
+		    process_hold(process, guard->timer, guard->config.freeze_deadline_ns,
+				 &ignored)) {
 			guard->dying_until_ns = now_ns() + DYING_NS;
+			all = false;
+		}
 	}
 	last_pid_unlock(guard->channel.numbers_fd);
+	return all;
+}
+
+void guard_hold_missing(struct avc_guard *guard)
+{
+	guard->hold_ns = now_ns() + HOLD_AGAIN_NS;
+	/* What has not stopped yet would not do so for this either. */
+	if (guard_tend_stragglers(guard))
+		return;
+	if (hold_all(guard) || !guard->count || ++guard->hold_tries == HOLD_TRIES)
+		guard->hold_ns = UINT64_MAX;
+	else
+		guard->hold_ns = now_ns() + (HOLD_AGAIN_NS << guard->hold_tries);
+}
+
+/* Only holders keep open what the other processes have open.  The next checkpoint would make those that
+ * are missing, and report why they were, but the next death may come before it. */
+void guard_hold_all(struct avc_guard *guard)
+{
+	guard->hold_tries = 0;
+	guard_hold_missing(guard);
 }
 
 /* The OOM killer also kills processes that share its victim's memory: the holder, too.  Until that
@@ -456,6 +483,7 @@ static void begin_death(struct avc_guard *guard, const struct avc_report *report
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_DIED);
 
+	guard->hold_ns = UINT64_MAX;
 	guard->channel.death = report->seq;
 	guard->channel.working_ns = now_ns();
 	event.wait_status = report->status;
