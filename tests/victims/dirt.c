@@ -30,7 +30,7 @@ enum {
 	BLOCKS = 8,
 	BLOCK_PAGES_MAX = 96,
 	FILE_PAGES = 64,
-	GROWN_MAX = 4096
+	GROWN_MAX = 1024 /* RLIMIT_STACK, mostly 8 MB, holds for any mapping that grows */
 };
 
 static size_t part_pages;
@@ -263,15 +263,18 @@ static void grow_down(void)
 		must(top != MAP_FAILED, "mmap");
 		top += PAGE;
 	}
-	if (pages < GROWN_MAX) {
-		pages++;
-		*(volatile uint64_t *)(top - pages * PAGE) = pages;
-	}
+	pages++;
+	*(volatile uint64_t *)(top - pages * PAGE) = pages;
 	for (uint64_t i = 1; i <= pages; i++) {
 		const uint64_t holds = *(uint64_t *)(top - i * PAGE);
 
 		CHECK(holds == i, "page %lu of what grows holds %lx", i, holds);
 	}
+	if (pages < GROWN_MAX)
+		return;
+	must(!munmap(top - pages * PAGE, pages * PAGE), "munmap");
+	top = NULL;
+	pages = 0;
 }
 
 /* As malloc(3) does: a block comes, grows, is protected, goes. */
