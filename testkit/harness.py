@@ -100,16 +100,19 @@ class Completed:
         return f"`{' '.join(self.args)}` ended with {self.status} after {self.took_s:.2f} s: {said}"
 
 
-def take_checkpoint(client: Client, name: str, timeout_s: float = 20 * SLOWNESS) -> None:
-    """As soon as there is something to take one of; a busy machine may be too slow for the freeze deadline."""
+def take_checkpoint(client: Client, name: str, timeout_s: float = 20 * SLOWNESS) -> int:
+    """As soon as there is something to take one of; returns its generation.
 
-    def taken() -> bool:
+    A busy machine may be too slow for the freeze deadline; the guard then tries again by itself, and there is one
+    generation more.
+    """
+
+    def taken() -> int:
         with contextlib.suppress(AvckptError):
-            client.command(name, Command.CHECKPOINT)
-            return True
-        return False
+            return int(client.command(name, Command.CHECKPOINT)["event"]["generation"])
+        return 0
 
-    wait_until(taken, timeout_s, f"a checkpoint of {name}", every_s=0.1)
+    return wait_until(taken, timeout_s, f"a checkpoint of {name}", every_s=0.1)
 
 
 class CommandFailed(AssertionError):

@@ -55,9 +55,9 @@ class ProtectedVictim:
             if event["id"] == self.container.id and event["kind"] in kinds
         ]
 
-    def checkpoint(self) -> None:
-        """Takes one, and waits for it."""
-        take_checkpoint(self.sidecar.client, self.container.name)
+    def checkpoint(self) -> int:
+        """Takes one, and waits for it; returns its generation."""
+        return take_checkpoint(self.sidecar.client, self.container.name)
 
     def kill(self, signum: int) -> dict[str, Any]:
         """Kills the victim as it is now, and waits for the restore; the entry of `avckpt ps` after it."""

@@ -34,20 +34,20 @@ def poison(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> Any
 
 def test_a_poisoned_generation_is_left_for_an_older_one(poison: Any) -> None:
     victim = poison(int(1000 * SLOWNESS), {"interval": "1h", "restore.max": "4/60s"})
-    victim.checkpoint()
+    clean = victim.checkpoint()
     os.kill(victim.app, signal.SIGUSR1)
-    victim.checkpoint()  # before it crashes: this image is poisoned
+    poisoned = victim.checkpoint()  # before it crashes
     entry = victim.sidecar.wait_restores(victim.container, 3)
     # Half of the four for the newest, then the clean one: and it lives.
-    assert entry["generation"] == 1
+    assert entry["generation"] == clean
     assert entry["generations"] == 1
-    assert "generation 2: what is restored from it keeps crashing" in entry["reason"]
+    assert f"generation {poisoned}: what is restored from it keeps crashing" in entry["reason"]
     victim.wait_beats(600, timeout_s=15)
     assert victim.sidecar.find(victim.container)["restores"] == 3
     assert victim.see().starts == 1
     dropped = victim.events("dropped")
-    assert [(event["generation"], event["attempt"]) for event in dropped] == [(2, 2)]
-    assert [event["generation"] for event in victim.events("restored")] == [2, 2, 1]
+    assert [(event["generation"], event["attempt"]) for event in dropped] == [(poisoned, 2)]
+    assert [event["generation"] for event in victim.events("restored")] == [poisoned, poisoned, clean]
 
 
 def test_checkpoints_in_between_do_not_keep_a_crash_loop_alive(poison: Any) -> None:

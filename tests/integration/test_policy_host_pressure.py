@@ -35,13 +35,13 @@ def test_the_one_that_holds_most_gives_its_oldest_up(tmp_path: Path) -> None:
         board = Board(tmp_path / "board")
         much = sidecar.protected("much", [str(VICTIMS / "hoard"), "40", "--board", str(board.path)], ON_COMMAND)
         wait_until(lambda: board.see().ready, 10, "it is ready")
-        take_checkpoint(sidecar.client, "much")
+        oldest = take_checkpoint(sidecar.client, "much")
         app = much.app_pid
         os.kill(app, signal.SIGUSR1)
         with pressure():
             wait_until(lambda: sidecar.row(much)["dropped"], 30, "a generation is given up")
         assert "the host is short of memory: much gives up a generation" in sidecar.log
-        assert "much: generation 1 is given up: memory is short" in sidecar.log
+        assert f"much: generation {oldest} is given up: memory is short" in sidecar.log
         assert sidecar.row(little)["dropped"] == 0  # which would free nothing
         back = sidecar.wait_for(much, generations=1, timeout_s=60)
         assert (back["state"], back["restores"]) == ("protected", 0)

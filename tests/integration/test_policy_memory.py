@@ -56,18 +56,18 @@ def test_near_its_limit_a_container_gives_the_oldest_generation_up(
     sidecar: Sidecar, container: ContainerFactory, tmp_path: Path, images: str
 ) -> None:
     victim = start_hoard(sidecar, container, tmp_path, 60, 190, images)
-    victim.checkpoint()
+    oldest = victim.checkpoint()
     write_hoard(victim, signal.SIGUSR1, 60)
     victim.checkpoint()
     # 120 MB are used, 60 more would be 180 of 190: it comes slowly.
     os.kill(victim.app, signal.SIGUSR2)
     entry = sidecar.wait_for(victim.container, lambda e: e["dropped"] >= 1, "a generation is given up")
-    assert entry["last_dropped"] == "generation 1: memory is short"
+    assert entry["last_dropped"] == f"generation {oldest}: memory is short"
     assert (entry["state"], entry["generations"]) == ("protected", 1)
     wait_until(lambda: len(templates(victim.container)) == 1, 5, "one template")
     assert entry["restores"] == 0
     # What is given up is free again, and nothing was killed.
-    assert [event["generation"] for event in told(sidecar, victim.container, "dropped")] == [1]
+    assert [event["generation"] for event in told(sidecar, victim.container, "dropped")] == [oldest]
     # One is held as long as memory is short, two when it is not.
     victim.checkpoint()
     assert held(sidecar, victim.container)["generations"] == 1
@@ -96,7 +96,8 @@ def test_memory_held_is_shown(
     # A page that somebody else has for a moment counts as half a page.
     assert (held_mb - 1) * MB < held(sidecar, victim.container)["memory_bytes"] < (held_mb + 5) * MB
     victim.checkpoint()
-    # Shared by both generations and no longer by the application: counted once.
+    # Forks share it with each other, and no longer with the application: counted once.  Copies need not.
     victim.checkpoint()
     write_hoard(victim, signal.SIGUSR1, held_mb)
-    assert (held_mb - 1) * MB < held(sidecar, victim.container)["memory_bytes"] < (held_mb + 10) * MB
+    most = held_mb * (1 if images == "fork" else 2)
+    assert (held_mb - 1) * MB < held(sidecar, victim.container)["memory_bytes"] < (most + 10) * MB
