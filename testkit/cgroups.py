@@ -71,8 +71,8 @@ class MemoryGroup:
             with contextlib.suppress(OSError):
                 folder.mkdir()
             if (folder / knob).exists():
-                self._folder = folder
-                (folder / knob).write_text(str(limit_bytes))
+                self._folder, self._knob = folder, knob
+                self.limit(limit_bytes)
                 return
             with contextlib.suppress(OSError):
                 folder.rmdir()
@@ -83,6 +83,10 @@ class MemoryGroup:
 
     def __exit__(self, *_: object) -> None:
         wait_until(self._removed, 10, "the cgroup is empty")
+
+    def limit(self, limit_bytes: int) -> None:
+        """From now on."""
+        (self._folder / self._knob).write_text(str(limit_bytes))
 
     def enter(self) -> None:
         """This process, from now on."""

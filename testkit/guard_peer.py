@@ -10,6 +10,7 @@ JSON on standard output.  Commands are lines on standard input:
     burst COOKIE TICKET N          N checkpoints back to back; one line {"burst": TICKET, ...} at the end
     check COOKIE MS                kills a guard that has not been heard of for so long
     tasks COOKIE LIMIT             its container may have so many, from now on
+    memory COOKIE BYTES            the same
     start COOKIE PID               another guard in place of that one, for the application below that init
     stop                           stops the guards and ends
 
@@ -27,6 +28,7 @@ import sys
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import avckpt.engine
 from avckpt.engine import Engine, Guard
@@ -123,8 +125,9 @@ class Peer:
         if words[0] == "check":
             self.guards[cookie].check(ticket / 1000)
             return
-        if words[0] == "tasks":
-            self.config = dataclasses.replace(self.config, tasks_max=ticket)
+        if words[0] in ("tasks", "memory"):
+            limit: dict[str, Any] = {{"tasks": "tasks_max", "memory": "memory_limit_bytes"}[words[0]]: ticket}
+            self.config = dataclasses.replace(self.config, **limit)
             self.guards[cookie].configure(self.config)
             return
         if words[0] == "start":

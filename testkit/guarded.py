@@ -212,6 +212,10 @@ class GuardProcess:
         """The limit of its container's tasks has changed (`podman update --pids-limit`)."""
         self._say(f"tasks {cookie} {limit}")
 
+    def say_memory(self, limit_bytes: int, cookie: int = 1) -> None:
+        """The limit of its container's memory has (`podman update --memory`)."""
+        self._say(f"memory {cookie} {limit_bytes}")
+
     def burst(self, n: int, cookie: int = 1, timeout_s: float = 110.0) -> Json:
         """`n` checkpoints back to back."""
         self.wait("attached", cookie=cookie)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from testkit.harness import SLOWNESS, Container, ContainerFactory, Sidecar, wait_until
-from testkit.protected import ours, start_hoard, told, write_hoard
+from testkit.protected import ours, start_hoard, start_victim, told, write_hoard
 
 pytestmark = pytest.mark.shared_machine(
     "whether a generation is given up in time before memory is short is a race with the application"
@@ -78,6 +78,39 @@ def test_near_its_limit_a_container_gives_the_oldest_generation_up(
 
     wait_until(two, 40, "two generations again", every_s=1.0)
     victim.kill(signal.SIGKILL)
+
+
+@pytest.mark.skipif(SLOWNESS > 1, reason="the sidecar is quicker there than the kernel's OOM killer")
+@pytest.mark.parametrize("images", IMAGES)
+def test_one_that_has_no_room_for_templates_is_left_alone(
+    sidecar: Sidecar, container: ContainerFactory, tmp_path: Path, images: str
+) -> None:
+    """140 of 256 MB, all written all the time: each template is killed at once, until the limit is raised."""
+    victim = start_victim(
+        sidecar,
+        container,
+        tmp_path,
+        "hoard 140 always",
+        labels={"images": images},
+        options=["--memory", "256m", "--memory-swap", "256m"],
+        generation=0,
+    )
+    app = victim.app
+    entry = sidecar.wait_for(victim.container, lambda e: "no other is made for 8 s" in e["reason"], "it is left alone")
+    assert (entry["state"], entry["generations"]) == ("unprotected", 0)
+    assert any("no other is made for 8 s" in str(event) for event in told(sidecar, victim.container, "dropped"))
+    taken = entry["checkpoints"]
+    victim.container.podman.run("update", "--memory", "1g", "--memory-swap", "1g", victim.container.name)
+    sidecar.wait_for(
+        victim.container,
+        lambda e: e["state"] == "protected" and e["checkpoints"] >= taken + 5,
+        "it is protected for good",
+        timeout_s=7,
+    )
+    assert held(sidecar, victim.container)["dropped"] == entry["dropped"]
+    victim.wait_beats()
+    assert victim.app == app
+    assert victim.see().starts == 1
 
 
 def templates(container: Container) -> list[int]:

@@ -9,9 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from avckpt.guard import Images
 
 from testkit.cgroups import MemoryGroup
-from testkit.guarded import GuardProcess, Victim, config
+from testkit.guarded import GuardProcess, Json, Victim, config
 from testkit.harness import wait_until
 
 pytestmark = pytest.mark.shared_machine(
@@ -76,6 +77,39 @@ def test_nobody_is_killed_for_what_a_template_holds(group: MemoryGroup, tmp_path
             assert guard.wait("dropped", count=n)["reason"] == "killed"
             wait_until(lambda n=n: victim.see().counter[0] == 140 * n, 10, "it has written all of it")  # type: ignore[misc]
             victim.wait_beats()
+        assert victim.app == app
+
+
+def spared_s(event: Json) -> int:
+    """So long no other template is made, it says; 0: it is not about that."""
+    words = event["error"]["message"] if event.get("kind") == "dropped" and event.get("error") else ""
+    return int(words.split()[5]) if words.startswith("no other is made for") else 0
+
+
+@pytest.mark.parametrize("images", [Images.FORK, Images.AUTO])
+@pytest.mark.parametrize("interval_min_s", [0.0, 0.02], ids=["fixed", "automatic"])
+def test_templates_that_are_killed_at_once_become_rare(
+    interval_min_s: float, images: Images, group: MemoryGroup, tmp_path: Path
+) -> None:
+    """140 of 256 MB, all written all the time."""
+    settings = config(0.5, memory_limit_bytes=LIMIT_BYTES, images=images, interval_min_s=interval_min_s)
+    with (
+        Victim("hoard 140 always", tmp_path, preexec=group.enter) as victim,
+        GuardProcess(settings, [victim.pid]) as guard,
+    ):
+        app, since = victim.app, 0
+        for expected_s in (1, 2, 4):
+            killed = guard.wait_for(lambda event: spared_s(event) > 0, "a pause", since=since)
+            assert spared_s(killed) == expected_s
+            since = guard.events.index(killed) + 1
+            if expected_s == 4:  # there is memory again
+                group.limit(4 * LIMIT_BYTES)
+                guard.say_memory(4 * LIMIT_BYTES)
+            taken = guard.wait("checkpoint", since=since)
+            assert (taken["at_ns"] - killed["at_ns"] >= expected_s * 1e9) == (expected_s < 4)
+        guard.wait("checkpoint", since=since, count=3)
+        assert not [event for event in guard.events[since:] if event.get("kind") == "dropped"]
+        victim.wait_beats()
         assert victim.app == app
 
 

@@ -893,6 +893,40 @@ def test_with_none_left_a_checkpoint_is_due_as_soon_as_there_is_memory(interval_
     assert guard.policy.room == 1
 
 
+def test_what_is_killed_at_once_is_made_less_and_less_often() -> None:
+    guard = Guarded(keep=1)
+    c, policy = guard.c, guard.policy
+
+    def killed(lived_s: float, count: int = 1) -> list[float]:
+        pauses_s = []
+        for _ in range(count):
+            guard.take()
+            guard.wait(lived_s)
+            guard.lose_one()
+            pauses_s.append(c.policy_killed(policy, guard.now) / SECOND)
+            assert policy.resumes_ns == guard.now + pauses_s[-1] * SECOND
+            guard.now = policy.resumes_ns
+        return pauses_s
+
+    assert killed(0.2, 9) == [1, 2, 4, 8, 16, 32, 60, 60, 60]
+    assert killed(9.9) == [60]
+    assert killed(10) == [0]  # it was good for something
+    assert killed(9, 3) == [1, 2, 4]
+    c.policy_refill(policy, guard.config)  # there is memory
+    assert killed(1, 2) == [1, 2]
+    c.policy_spare_no_more(policy)  # its limit was raised
+    assert policy.resumes_ns == 0
+    assert killed(1, 2) == [1, 2]
+    c.policy_executed(policy, guard.config, guard.now, guard.now)
+    assert killed(1, 2) == [1, 2]
+    # Replaced by others, so that one was held all the time.
+    guard.take()
+    for _ in range(9):
+        guard.wait(1)
+        guard.take()
+    assert killed(1) == [0]
+
+
 @pytest.mark.parametrize(
     ("room", "was", "keep", "result"),
     [(3, 3, 5, 5), (3, 3, 2, 2), (2, 3, 5, 2), (2, 3, 1, 1), (0, 3, 5, 0)],

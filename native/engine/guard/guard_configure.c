@@ -23,7 +23,8 @@ void guard_take_config(struct avc_guard *guard, const struct avc_config *config)
 {
 	const uint32_t keep = guard->config.keep;
 	const uint8_t suspends = guard->config.suspends;
-	const uint64_t tasks_max = guard->config.tasks_max;
+	const uint64_t tasks_max = guard->config.tasks_max,
+		       memory = guard->config.memory_limit_bytes;
 
 	guard_set_config(guard, config);
 	guard->config.suspends = suspends;
@@ -36,6 +37,9 @@ void guard_take_config(struct avc_guard *guard, const struct avc_config *config)
 		policy_retry(&guard->policy);
 		guard->cramped = false;
 	}
+	/* 0, too: it says no more than that the limit is not where memory runs out. */
+	if (memory && config->memory_limit_bytes > memory)
+		policy_spare_no_more(&guard->policy);
 	if (guard->attached)
 		guard->next_ns = policy_due_again(config, guard->next_ns, now_ns());
 }

@@ -400,6 +400,17 @@ static bool container_ends(const struct avc_guard *guard, int ms)
 	return ms < CONTAINER_ENDS_MS && proc_is_killed(guard->channel.init);
 }
 
+/* The last one held, as the event says: the next may have to wait. */
+static void note_killed(struct avc_guard *guard, struct avc_event *event)
+{
+	const uint64_t pause = policy_killed(&guard->policy, now_ns());
+
+	if (pause)
+		fail(&event->error, AVC_LIMIT, 0, 0, "", "",
+		     "no other is made for %u s, as they are killed at once",
+		     (unsigned)(pause / NS_PER_S));
+}
+
 /* Templates that were killed: by us, from inside the container or by the OOM killer. */
 void guard_reap_dead(struct avc_guard *guard)
 {
@@ -437,6 +448,8 @@ void guard_reap_dead(struct avc_guard *guard)
 	/* It had reported a death that it does not undo. */
 	if (proc_is_killed(guard->channel.init))
 		return;
+	if (!guard->count)
+		note_killed(guard, &events[count - 1]);
 	for (uint32_t i = 0; i < count; i++)
 		guard_emit(guard, &events[i]);
 }

@@ -217,6 +217,10 @@ bool guard_pace_wants(struct avc_guard *guard)
 {
 	const uint64_t now = now_ns();
 
+	if (!guard->count && now < guard->policy.resumes_ns) {
+		guard->next_ns = guard->policy.resumes_ns;
+		return false;
+	}
 	/* With strict files, writes by other processes count, too. */
 	if (!policy_is_automatic(&guard->config) || !guard->count ||
 	    guard->config.files == AVC_FILES_STRICT || wants(guard, now)) {

@@ -27,6 +27,7 @@
 #define SOON_NS (100 * MS)
 #define AGAIN_LEAST_NS (1000 * MS)
 #define LONG_NS UINT64_C(60000000000)
+#define LIVED_NS UINT64_C(10000000000)
 /* The CPU time that a checkpoint itself makes an idle app use: restarted calls. */
 #define NOISE_NS (MS / 5)
 /* After a restore: an app that dies within this time has met the bug in the image. */
@@ -109,6 +110,8 @@ struct policy_generation policy_new_generation(struct policy *policy,
 {
 	struct policy_generation fresh = { .number = number, .taken_ns = now };
 
+	if (!policy->count)
+		policy->held_ns = now;
 	if (!policy_on_probation(policy, config, now)) {
 		policy->restored_ns = 0;
 		policy->lineage = ++policy->lineages;
@@ -251,6 +254,7 @@ uint64_t policy_executed(struct policy *policy, const struct avc_config *config,
 	const uint64_t first = policy_first_due(config, now);
 
 	policy_retry(policy);
+	policy_spare_no_more(policy);
 	if (!refused || first == POLICY_NEVER)
 		return due;
 	return lesser(due, lesser(first, now + AGAIN_LEAST_NS));
@@ -403,6 +407,23 @@ void policy_drop(struct policy *policy, uint32_t i)
 		policy->held[i] = policy->held[i + 1];
 }
 
+uint64_t policy_killed(struct policy *policy, uint64_t now)
+{
+	if (now - policy->held_ns >= LIVED_NS)
+		policy->spared_ns = 0;
+	else if (policy->spared_ns)
+		policy->spared_ns = lesser(2 * policy->spared_ns, LONG_NS);
+	else
+		policy->spared_ns = AGAIN_LEAST_NS;
+	policy->resumes_ns = now + policy->spared_ns;
+	return policy->spared_ns;
+}
+
+void policy_spare_no_more(struct policy *policy)
+{
+	policy->spared_ns = policy->resumes_ns = 0;
+}
+
 /* The oldest, but not what a rollback of a hung process would need. */
 uint32_t policy_dispensable(const struct policy *policy)
 {
@@ -424,6 +445,7 @@ bool policy_refill(struct policy *policy, const struct avc_config *config)
 	const bool short_before = policy->room != config->keep;
 
 	policy->room = config->keep;
+	policy_spare_no_more(policy);
 	return short_before && !policy->count && config->interval_ns;
 }
 

@@ -52,6 +52,9 @@ struct policy {
 	bool proved;            /* has made progress since it was restored */
 	uint64_t refused_ns;    /* since when it cannot be protected; 0: it can   */
 	uint64_t without_ns;    /* since when one is missed and none is held; 0: no  */
+	uint64_t held_ns;       /* since when at least one is held                 */
+	uint64_t spared_ns;     /* since its last one was killed there is none for so long */
+	uint64_t resumes_ns;    /* ... until then                                      */
 	/* The last immediate death that was the program's own. */
 	int at_once_status;
 	uint32_t at_once_lineage;
@@ -172,6 +175,12 @@ uint64_t policy_look_again(const struct policy_pace *pace, const struct avc_conf
 
 /* held[i] is gone, whatever the reason. */
 void policy_drop(struct policy *policy, uint32_t i);
+/* The last one held was killed, as by the OOM killer: for how long there is no other one.  If at least
+ * one was held for ten seconds, 0; else a second, twice as long each time, at most a minute: where each
+ * is killed at once the app pays for it, and gains nothing. */
+uint64_t policy_killed(struct policy *policy, uint64_t now);
+/* What killed them may have gone. */
+void policy_spare_no_more(struct policy *policy);
 /* Which one to drop next.  There is at least one. */
 uint32_t policy_dispensable(const struct policy *policy);
 /* Memory is short: from now on holds one fewer than now. */

@@ -147,7 +147,8 @@ class Protected:
             self.last_dropped = f"generation {event.generation}: {why_dropped(event.reason)}"
             if self.state is State.PROTECTED:
                 left = f"; {event.generations} left" if event.generations else ""
-                self._suffer(f"{self.last_dropped}{left}")
+                why = f": {event.error}" if event.error else ""
+                self._suffer(f"{self.last_dropped}{why}{left}")
         elif kind is Kind.GAVE_UP:
             how = describe_wait_status(event.wait_status)
             self._to(State.ENDED, f"{how}; {why_not_restored(event.reason, event.error)}")

@@ -344,7 +344,7 @@ _MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
     Kind.CORE: lambda record: record.detail,
     Kind.LATE: lambda record: f"{record.detail}: {(record.recovered_s or 0) * 1000:.1f} ms after its death",
     Kind.GAVE_UP: lambda record: f"not restored ({describe_wait_status(record.wait_status or 0)}): {_why_not(record)}",
-    Kind.DROPPED: lambda record: f"generation {record.generation} is given up: {record.detail}{_crashes(record)}",
+    Kind.DROPPED: lambda record: f"generation {record.generation} is given up: {_detail(record)}{_crashes(record)}",
     Kind.HEALTH: _detail,
     Kind.CONFIGURED: _detail,
     Kind.REFUSED: lambda record: f"command refused: {record.error}",
