@@ -47,6 +47,11 @@ def limit_for(guard: GuardProcess, free: int) -> int:
     return [number for number in range(len(used) + free + 1) if number not in used][free]
 
 
+def cpu_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def losses(guard: GuardProcess) -> list[object]:
     return [event for event in guard.events if event.get("kind") in KINDS_OF_LOSS]
 
@@ -112,3 +117,17 @@ def test_there_are_none_for_long(tmp_path: Path) -> None:
         with limited(guard, resource.RLIMIT_NOFILE, FEW):
             victim.kill_app()
             check_says(guard.wait("gave_up"), errno.EMFILE, "its guard may not open any more files")
+
+
+def test_more_are_waited_for_than_may_be_open(tmp_path: Path) -> None:
+    with Victim("idle 1 2", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        guard.checkpoint()
+        with limited(guard, resource.RLIMIT_NOFILE, 1):
+            answer = guard.command("checkpoint")
+            before = cpu_s(guard.pid)
+            time.sleep(MOMENT_S * 10)
+            assert cpu_s(guard.pid) - before < MOMENT_S * 5
+        check_says(answer, errno.EMFILE, "its guard may not open any more files")
+        assert not losses(guard)
+        assert guard.checkpoint()["kind"] == "checkpoint"
+        victim.wait_beats()

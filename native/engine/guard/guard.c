@@ -22,6 +22,7 @@
 #define LEFT_NS (2 * NS_PER_S) /* helpers of a guard that was killed have ended */
 #define STRAGGLER_NS (NS_PER_MS / 5)
 #define STRAGGLER_LONG_NS (20 * NS_PER_MS)
+#define UNPOLLED_US 10000
 #define LAST_WORDS_NS NS_PER_S
 #define SEEN_NS (200 * NS_PER_MS)     /* for the daemon to look at the memory of the dead */
 #define REQUEST_FDS 2                 /* sent with one, at most                                  */
@@ -433,6 +434,11 @@ static int poll_until(struct pollfd *fds, nfds_t n, uint64_t until, bool straggl
 
 	heartbeat_rest(until);
 	ready = straggling ? tracee_poll(fds, n, &timeout) : ppoll(fds, n, &timeout, NULL);
+	if (ready < 0 && errno == EINVAL) {
+		/* They are more than it may have open by now (RLIMIT_NOFILE, poll(2)): looks at all. */
+		usleep(UNPOLLED_US);
+		ready = 1;
+	}
 	heartbeat_rest(0);
 	heartbeat();
 	return ready;
