@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
 import os
 import resource
 import time
@@ -15,8 +16,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from avckpt.guard import Images
 
-from testkit.guarded import WHERE, GuardProcess, Victim, config
+from testkit.guarded import WHERE, GuardProcess, Victim, config, injected
 
 KINDS_OF_LOSS = ("dropped", "unprotected", "gave_up")
 MOMENT_S = 0.1
@@ -24,6 +26,9 @@ FEW = 16
 """So many can be waited for, poll(2), and it has more open."""
 LEVELS = 8
 """With so many free ones it has all that it takes."""
+
+
+OPENERS = "openat,pidfd_open,pidfd_getfd,memfd_create,socket"
 
 
 @pytest.fixture(autouse=True)
@@ -130,4 +135,33 @@ def test_more_are_waited_for_than_may_be_open(tmp_path: Path) -> None:
         check_says(answer, errno.EMFILE, "its guard may not open any more files")
         assert not losses(guard)
         assert guard.checkpoint()["kind"] == "checkpoint"
+        victim.wait_beats()
+
+
+@pytest.mark.parametrize("first", [True, False], ids=["first", "another"])
+@pytest.mark.parametrize(
+    ("command", "images"),
+    [("tree 2", Images.FORK), ("idle 1 2 --in-child", Images.FORK), ("hoard 40", Images.DIRTY)],
+)
+def test_each_descriptor_is_not_to_be_had_once(command: str, images: Images, first: bool, tmp_path: Path) -> None:
+    """It is said, or does not matter; and the next checkpoint is as any other one."""
+    settings, log = config(images=images), tmp_path / "log"
+    with Victim(command, tmp_path) as victim, GuardProcess(settings, [victim.pid]) as guard:
+        guard.checkpoint()
+        for n in itertools.count(1):
+            if first:
+                guard.start_another(victim.pid)
+            since = guard.mark()
+            with injected(guard, OPENERS, f"error=EMFILE:when={n}", log):
+                answer = guard.command("checkpoint")
+            failed = [line for line in log.read_text().splitlines() if "INJECTED" in line]
+            if not failed:
+                break
+            if answer["kind"] == "missed" and answer["error"]["kind"] != "deadline":
+                assert answer["error"]["errno"] == errno.EMFILE, (answer, failed)
+            elif answer["kind"] != "missed":
+                assert (answer["kind"], answer.get("error")) == ("checkpoint", None), (answer, failed)
+            assert not [event for event in guard.events[since:] if event.get("kind") in KINDS_OF_LOSS], failed
+            assert guard.checkpoint()["kind"] == "checkpoint", failed
+        assert n > LEVELS
         victim.wait_beats()

@@ -6,7 +6,6 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <linux/openat2.h>
-#include <pthread.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -151,25 +150,30 @@ void mounts_free(struct mounts *mounts)
 #define HUGE_SHIFTS 40 /* of sizes of pages: MFD_HUGE_2MB and others */
 #define HUGE_SHIFT_BIT 26
 
-static pthread_once_t memory_once = PTHREAD_ONCE_INIT;
+static bool memory_is_known;
 static uint64_t memory_device[HUGE_SHIFTS + 1];
 
 static void find_memory(void)
 {
+	bool all = true;
+
 	for (unsigned int shift = 0; shift <= HUGE_SHIFTS; shift++) {
 		const unsigned int huge = shift ? MFD_HUGETLB | shift << HUGE_SHIFT_BIT : 0;
 		int fd = memfd_create("avckpt", MFD_CLOEXEC | huge);
 		struct statx st;
 
+		all &= fd >= 0 || (errno != EMFILE && errno != ENFILE);
 		if (fd >= 0 && fd_look(fd, STATX_TYPE, &st))
 			memory_device[shift] = device_of(&st);
 		close_fd(&fd);
 	}
+	memory_is_known = all;
 }
 
 bool device_is_memory(uint64_t device)
 {
-	pthread_once(&memory_once, find_memory);
+	if (!memory_is_known)
+		find_memory();
 	for (size_t i = 0; device && i < sizeof memory_device / sizeof *memory_device; i++)
 		if (memory_device[i] == device)
 			return true;

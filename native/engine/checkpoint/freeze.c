@@ -55,19 +55,14 @@ static pid_t group_inside(const struct tree *tree, pid_t group)
 	return inside || group <= 0 ? inside : proc_inside(group);
 }
 
-static bool is_there(pid_t pid)
-{
-	struct proc_stat stat;
-
-	return proc_stat(pid, &stat) == 0;
-}
-
 /* A leader that is not of the app: either it is gone, and the PID is not reused while its session
  * has members; or it is outside (`podman exec`), and its session cannot be joined. */
 static pid_t session_of_other(const struct tree_entry *entry, const struct proc_status *status,
 			      struct image *image)
 {
-	if (!is_there(entry->stat.session))
+	struct proc_stat leader;
+
+	if (proc_stat(entry->stat.session, &leader))
 		return status->session;
 	if (entry->process)
 		fail(&image->notice, AVC_UNSUPPORTED, 0, entry->pid, "freeze", "",
@@ -78,29 +73,37 @@ static pid_t session_of_other(const struct tree_entry *entry, const struct proc_
 }
 
 /* Now, while all are stopped: right after, it may be in another group, or the group's leader may be
- * gone. */
-static void keep_place(const struct tree *tree, const struct tree_entry *entry,
-		       const struct image *main, struct image *image)
+ * gone.  A leader that cannot be seen for want of descriptors is none that is gone. */
+static int keep_place(const struct tree *tree, const struct tree_entry *entry,
+		      const struct image *main, struct image *image, struct avc_error *err)
 {
 	const struct proc_stat *stat = &entry->stat, *of_main = &tree->entry[0].stat;
+	const bool other_session = stat->session != of_main->session;
 	struct proc_status status = { 0 };
-	pid_t session = number_inside(tree, stat->session), group;
+	pid_t session, group = 0;
 
+	errno = 0;
 	image->pid = entry->pid;
-	image->inside = entry->ended ? proc_inside(entry->pid) : entry->process->inside;
 	image->stat = *stat;
-	group = number_inside(tree, stat->group);
+	image->exit_signal = stat->exit_signal;
+	image->inside = entry->ended ? proc_inside(entry->pid) : entry->process->inside;
+	session = number_inside(tree, stat->session);
+	if (!is_shortage(errno))
+		group = number_inside(tree, stat->group);
 	if (!group && image != main && stat->group == of_main->group)
 		group = main->group;
 	/* The kernel knows the numbers inside, whichever process had them. */
-	if (!group || (!session && stat->session != of_main->session))
+	if (!is_shortage(errno) && (!group || (!session && other_session)))
 		(void)proc_status(entry->pid, &status);
-	if (!session && stat->session != of_main->session)
+	if (!is_shortage(errno) && !session && other_session)
 		session = session_of_other(entry, &status, image);
 	image->session = session;
 	image->group = group ? group : status.group;
-	image->tty_group = stat->tty ? group_inside(tree, stat->tty_group) : 0;
-	image->exit_signal = stat->exit_signal;
+	if (!is_shortage(errno) && stat->tty)
+		image->tty_group = group_inside(tree, stat->tty_group);
+	return is_shortage(errno)
+		       ? fail_errno(err, entry->pid, "freeze", "open(status)", "it cannot be seen")
+		       : 0;
 }
 
 /* The processes found become the images, in the same order. */
@@ -115,7 +118,8 @@ static int make_images(const struct tree *tree, struct generation *generation,
 				  "it has ended");
 	if (generation_make_room(generation, tree->count, err))
 		return -1;
-	keep_place(tree, &tree->entry[0], &generation->image[0], &generation->image[0]);
+	if (keep_place(tree, &tree->entry[0], &generation->image[0], &generation->image[0], err))
+		return -1;
 	index[0] = 0;
 	for (uint32_t i = 1; i < tree->count; i++) {
 		const struct tree_entry *entry = &tree->entry[i];
@@ -132,7 +136,8 @@ static int make_images(const struct tree *tree, struct generation *generation,
 			.pidfd = -1,
 			.slot = slot,
 		};
-		keep_place(tree, entry, &generation->image[0], image);
+		if (keep_place(tree, entry, &generation->image[0], image, err))
+			return -1;
 		if (entry->ended) {
 			if (image->parent == PARENT_INIT || image->inside <= 0)
 				continue; /* init is just about to wait for it */

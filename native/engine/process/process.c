@@ -140,14 +140,15 @@ int process_open(struct process *process, pid_t pid, pid_t inside, struct avc_er
 	process->task_dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
 	process->timers_fd = proc_open(pid, "timers", O_RDONLY);
 	process->stat_fd = proc_open(pid, "stat", O_RDONLY);
-	if (follow(process, err)) {
-		process_close(process);
-		return -1;
+	if (process->task_dirfd >= 0 && process->timers_fd >= 0 && process->stat_fd >= 0) {
+		if (follow(process, err)) {
+			process_close(process);
+			return -1;
+		}
+		process->mem_fd = proc_open(process->pid, "mem", O_RDWR);
 	}
-	process->mem_fd = proc_open(process->pid, "mem", O_RDWR);
-	if (process->pidfd < 0 || process->task_dirfd < 0 || process->mem_fd < 0 ||
-	    process->timers_fd < 0 || process->stat_fd < 0 || process->statm_fd < 0 ||
-	    process->status_fd < 0) {
+	if (process->task_dirfd < 0 || process->mem_fd < 0 || process->timers_fd < 0 ||
+	    process->stat_fd < 0 || process->statm_fd < 0 || process->status_fd < 0) {
 		fail_errno(err, pid, "attach", "open(/proc)", "its /proc cannot be read");
 		process_close(process);
 		return -1;

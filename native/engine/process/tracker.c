@@ -95,9 +95,13 @@ static int open_in(struct process *process, pid_t child, const struct arch_regs 
 		return fail(err, AVC_DEADLINE, 0, child, "watch memory", "", "too many at once");
 	if (parasite_run(child, call, err))
 		return -1;
-	if (made->result < 0)
-		return fail(err, AVC_UNSUPPORTED, (int)-made->result, child, "watch memory",
-			    "userfaultfd", "the kernel does not allow it");
+	if (made->result < 0) {
+		errno = (int)-made->result;
+		return is_shortage(errno) ? fail_errno(err, child, "watch memory", "userfaultfd",
+						       "there is none left")
+					  : fail(err, AVC_UNSUPPORTED, errno, child, "watch memory",
+						 "userfaultfd", "the kernel does not allow it");
+	}
 	pidfd = proc_pidfd_open(child);
 	fd = only_userfaultfd(pidfd < 0 ? -1 : proc_borrow_fd(pidfd, 0));
 	close_fd(&pidfd);
@@ -114,7 +118,7 @@ static int open_by_watcher(struct process *process, pid_t child, const struct ar
 {
 	const struct timespec patience = { .tv_sec = HAND_OVER_S };
 	struct inj_call *call = &process->parasite.control->runner;
-	int pidfd, fd = -1;
+	int pidfd, fd = -1, errnum;
 
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_close_range, 0, ~0u, CLOSE_RANGE_UNSHARE);
@@ -127,13 +131,20 @@ static int open_by_watcher(struct process *process, pid_t child, const struct ar
 	call_add(call, SYS_exit_group, TRACKER_UFFD_FLAGS);
 	if (parasite_send(&process->parasite, child, base, call, err))
 		return -1;
+	errno = 0;
 	pidfd = proc_pidfd_open(child);
+	errnum = errno;
 	if (pidfd >= 0 && ptrace(PTRACE_DETACH, child, NULL, NULL) == 0) {
 		fd = only_userfaultfd(watcher_open(child, pidfd));
+		errnum = errno;
 		syscall(SYS_pidfd_send_signal, pidfd, SIGKILL, NULL, 0);
 	}
 	close_fd(&pidfd);
-	return fd >= 0 ? fd
+	if (fd >= 0)
+		return fd;
+	errno = errnum;
+	return is_shortage(errno)
+		       ? fail_errno(err, child, "watch memory", "pidfd_open", "it was killed")
 		       : fail(err, AVC_UNSUPPORTED, 0, child, "watch memory", "userfaultfd",
 			      "it was not made in time, or the kernel does not allow it");
 }
@@ -290,9 +301,13 @@ int tracker_watch(struct process *process, char *layout, struct avc_error *err)
 		fclose(text);
 	if (result)
 		return fail_memory(err, process->pid, "watch memory");
+	errno = 0;
 	if (watch.refused.end && proc_mappings(process->pid, "smaps", check_refused, &watch))
-		return fail(err, AVC_UNSUPPORTED, errno, process->pid, "watch memory",
-			    "ioctl(UFFDIO_REGISTER)", "some of it cannot be watched");
+		return is_shortage(errno)
+			       ? fail_errno(err, process->pid, "watch memory", "open(smaps)",
+					    "it cannot be seen")
+			       : fail(err, AVC_UNSUPPORTED, errno, process->pid, "watch memory",
+				      "ioctl(UFFDIO_REGISTER)", "some of it cannot be watched");
 	return 0;
 }
 

@@ -390,11 +390,12 @@ int attributes_keep(struct image *image, struct avc_error *err)
 	if (!kept)
 		return fail_memory(err, 0, "keep template");
 	/* It may be dying: what is restored must not stay the OOM killer's first choice. */
+	errno = ESRCH;
 	if (proc_read(process->pid, "oom_score_adj", kept->oom_score_adj,
 		      sizeof kept->oom_score_adj) <= 0 &&
-	    !process->descendant) /* else it has its parent's */
-		return fail(err, AVC_GONE, ESRCH, process->pid, "keep template", "",
-			    "it has ended");
+	    (!process->descendant || is_shortage(errno))) /* else it has its parent's */
+		return fail_errno(err, process->pid, "keep template", "open(oom_score_adj)",
+				  "it has ended");
 	if (!image->oom_known && kept->oom_score_adj[0]) { /* it was cloned with that */
 		image->oom_own = image->oom_told = atoi(kept->oom_score_adj);
 		image->oom_known = true;
@@ -424,6 +425,8 @@ static int put_back(pid_t tid, void *arg)
 	const struct search *search = arg;
 	const pid_t inside = proc_inside(tid);
 
+	if (inside < 0 && is_shortage(errno))
+		fail_errno(search->notice, tid, "restore", "open(status)", "it cannot be seen");
 	for (uint32_t i = 0; i < search->attributes->count; i++) {
 		const struct scheduling *s = &search->attributes->thread[i].scheduling;
 
@@ -463,8 +466,11 @@ void attributes_put_back(const struct attributes *attributes, pid_t pid, struct 
 	if (has_all(attributes, pid))
 		return;
 	dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
-	if (dirfd < 0)
-		return; /* it has already been killed again */
+	if (dirfd < 0) {
+		if (is_shortage(errno)) /* else it has already been killed again */
+			fail_errno(notice, pid, "restore", "open(task)", "it cannot be seen");
+		return;
+	}
 	(void)proc_numbers(dirfd, put_back, &search);
 	close(dirfd);
 }

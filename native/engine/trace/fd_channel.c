@@ -59,6 +59,8 @@ int fd_receive(int socket)
 	do
 		n = recvmsg(socket, &letter.head, MSG_CMSG_CLOEXEC);
 	while (n < 0 && errno == EINTR);
+	if (n > 0 && letter.head.msg_flags & MSG_CTRUNC)
+		errno = EMFILE; /* there was one, but no number for it */
 	return n > 0 ? fd_letter_number(&letter) : -1;
 }
 

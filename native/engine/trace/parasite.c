@@ -6,7 +6,6 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <linux/futex.h>
-#include <pthread.h>
 #include <signal.h>
 #include <stdio.h>
 #include <string.h>
@@ -61,7 +60,6 @@ static int make_memory(size_t bytes)
 }
 
 /* The code is the same in every process, and sealed: one memfd for all. */
-static pthread_once_t code_once = PTHREAD_ONCE_INIT;
 static int code_fd = -1;
 
 static void make_code(void)
@@ -82,9 +80,10 @@ int parasite_make(struct parasite *parasite, uint64_t nonce, struct avc_error *e
 	int fd;
 	uint8_t *map;
 
-	pthread_once(&code_once, make_code);
-	fd = make_memory(parasite->bytes - INJ_CODE_BYTES);
-	if (code_fd < 0 || fd < 0 || fcntl(fd, F_ADD_SEALS, F_SEAL_SEAL)) {
+	if (code_fd < 0)
+		make_code();
+	fd = code_fd < 0 ? -1 : make_memory(parasite->bytes - INJ_CODE_BYTES);
+	if (fd < 0 || fcntl(fd, F_ADD_SEALS, F_SEAL_SEAL)) {
 		close_fd(&fd);
 		return fail_errno(err, 0, "infect", "memfd_create", "no memory for the parasite");
 	}
