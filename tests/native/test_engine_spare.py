@@ -289,6 +289,27 @@ def test_there_is_room_for_one_again(tmp_path: Path) -> None:
         wait_spare(victim)
 
 
+def test_there_is_room_for_one_when_others_of_its_user_have_ended() -> None:
+    """The limit of tasks that is not the container's: nobody tells."""
+    with subprocess.Popen([*SOMEBODY.split(), "/usr/bin/sleep", "1000"]) as other:
+        try:
+            wait_until(lambda: processes_of(USER), PATIENCE_S, "it is that user's")
+            with limited(8) as (victim, guard):
+                assert guard.checkpoint()["kind"] == "checkpoint"
+                wait_spare(victim)
+                assert guard.checkpoint()["kind"] == "checkpoint"
+                assert not spares(victim)
+                other.kill()
+                other.wait()
+
+                def has_one() -> bool:
+                    return guard.checkpoint()["kind"] == "checkpoint" and bool(spares(victim))
+
+                wait_until(has_one, PATIENCE_S, "a spare", every_s=1.0)
+        finally:
+            other.kill()
+
+
 def policies(victim: Victim, name: str) -> set[int]:
     found = set()
     for pid in ours(victim, name):

@@ -893,6 +893,19 @@ def test_with_none_left_a_checkpoint_is_due_as_soon_as_there_is_memory(interval_
     assert guard.policy.room == 1
 
 
+def test_a_spare_that_had_to_make_way_comes_back_later_and_later() -> None:
+    guard = Guarded()
+    c, policy = guard.c, guard.policy
+
+    def pauses_s(count: int) -> list[float]:
+        return [(c.policy_crowded(policy, guard.now) - guard.now) / SECOND for _ in range(count)]
+
+    assert pauses_s(11) == [10, 20, 40, 80, 160, 320, 640, 1280, 2560, 3600, 3600]
+    c.policy_roomier(policy)
+    assert policy.spares_ns == 0
+    assert pauses_s(2) == [10, 20]
+
+
 def test_what_is_killed_at_once_is_made_less_and_less_often() -> None:
     guard = Guarded(keep=1)
     c, policy = guard.c, guard.policy
@@ -914,10 +927,8 @@ def test_what_is_killed_at_once_is_made_less_and_less_often() -> None:
     assert killed(9, 3) == [1, 2, 4]
     c.policy_refill(policy, guard.config)  # there is memory
     assert killed(1, 2) == [1, 2]
-    c.policy_spare_no_more(policy)  # its limit was raised
+    c.policy_roomier(policy)  # its limit was raised, or it is another program
     assert policy.resumes_ns == 0
-    assert killed(1, 2) == [1, 2]
-    c.policy_executed(policy, guard.config, guard.now, guard.now)
     assert killed(1, 2) == [1, 2]
     # Replaced by others, so that one was held all the time.
     guard.take()

@@ -387,7 +387,7 @@ static bool may_make_spare(const struct avc_guard *guard, const struct generatio
 static bool wants_spare(const struct avc_guard *guard, const struct generation *newest)
 {
 	return !newest->spare.tried && !newest->spare.unwanted && !guard->cramped &&
-	       may_make_spare(guard, newest) &&
+	       now_ns() >= guard->policy.spares_ns && may_make_spare(guard, newest) &&
 	       (!stand_in_is_there(&guard->dirty, newest) ||
 		dirty_wants_spare(&guard->dirty, newest));
 }
@@ -613,7 +613,8 @@ static bool make_way(struct avc_guard *guard, const struct avc_error *err)
 	guard_release_oldest_remains(guard, 1);
 	guard_await_spares(guard);
 	for (uint32_t i = 0; i < guard->count; i++) {
-		guard->cramped |= guard->generations[i].spare.pid != 0;
+		if (guard->generations[i].spare.pid)
+			(void)policy_crowded(&guard->policy, now_ns());
 		spare_drop(&guard->generations[i]);
 	}
 	if (tracee_ending_pidfd(0) < 0)

@@ -35,11 +35,11 @@ void guard_take_config(struct avc_guard *guard, const struct avc_config *config)
 	/* It may not have to be refused any more, and there may be room for spares. */
 	if (config->tasks_max != tasks_max) {
 		policy_retry(&guard->policy);
-		guard->cramped = false;
+		policy_roomier(&guard->policy);
 	}
 	/* 0, too: it says no more than that the limit is not where memory runs out. */
 	if (memory && config->memory_limit_bytes > memory)
-		policy_spare_no_more(&guard->policy);
+		policy_roomier(&guard->policy);
 	if (guard->attached)
 		guard->next_ns = policy_due_again(config, guard->next_ns, now_ns());
 }

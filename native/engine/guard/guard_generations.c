@@ -275,6 +275,7 @@ static void lose_program(struct avc_guard *guard)
 {
 	tracker_end(&guard->main);
 	lose_images(guard, AVC_REASON_EXECUTED);
+	policy_roomier(&guard->policy);
 	guard->main.infected = false; /* the parasite went with its memory */
 }
 

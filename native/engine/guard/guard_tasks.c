@@ -23,9 +23,18 @@ static uint64_t of_app(const struct avc_guard *guard)
 	return tasks;
 }
 
+static uint64_t spares(const struct avc_guard *guard)
+{
+	uint64_t tasks = 0;
+
+	for (uint32_t i = 0; i < guard->count; i++)
+		tasks += guard->generations[i].spare.pid != 0;
+	return tasks;
+}
+
 static uint64_t held(const struct avc_guard *guard)
 {
-	uint64_t tasks = guard->remains_count;
+	uint64_t tasks = guard->remains_count + spares(guard);
 
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		tasks += guard->tree.process[i]->holder != 0;
@@ -34,7 +43,6 @@ static uint64_t held(const struct avc_guard *guard)
 	for (uint32_t i = 0; i < guard->count; i++) {
 		const struct generation *generation = &guard->generations[i];
 
-		tasks += generation->spare.pid != 0;
 		for (uint32_t k = 0; k < generation->images; k++)
 			tasks += generation->image[k].template != 0;
 	}
@@ -78,9 +86,10 @@ int guard_make_room_for_tasks(struct avc_guard *guard, struct avc_error *err)
 	const uint64_t limit = guard->config.tasks_max, app = of_app(guard);
 	const uint64_t most = limit > app ? (limit - app) * PERCENT / 100 : 0;
 
+	guard->cramped = false;
 	if (!limit)
 		return 0;
-	guard->cramped |= held(guard) + needed(guard) >= most;
+	guard->cramped = held(guard) - spares(guard) + needed(guard) >= most;
 	if (keep_to(guard, most))
 		return 0;
 	return fail(

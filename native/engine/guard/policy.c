@@ -27,6 +27,8 @@
 #define SOON_NS (100 * MS)
 #define AGAIN_LEAST_NS (1000 * MS)
 #define LONG_NS UINT64_C(60000000000)
+#define CROWDED_NS UINT64_C(10000000000)
+#define HOUR_NS UINT64_C(3600000000000)
 #define LIVED_NS UINT64_C(10000000000)
 /* The CPU time that a checkpoint itself makes an idle app use: restarted calls. */
 #define NOISE_NS (MS / 5)
@@ -254,7 +256,6 @@ uint64_t policy_executed(struct policy *policy, const struct avc_config *config,
 	const uint64_t first = policy_first_due(config, now);
 
 	policy_retry(policy);
-	policy_spare_no_more(policy);
 	if (!refused || first == POLICY_NEVER)
 		return due;
 	return lesser(due, lesser(first, now + AGAIN_LEAST_NS));
@@ -419,9 +420,18 @@ uint64_t policy_killed(struct policy *policy, uint64_t now)
 	return policy->spared_ns;
 }
 
-void policy_spare_no_more(struct policy *policy)
+void policy_roomier(struct policy *policy)
 {
 	policy->spared_ns = policy->resumes_ns = 0;
+	policy->crowded_ns = policy->spares_ns = 0;
+}
+
+uint64_t policy_crowded(struct policy *policy, uint64_t now)
+{
+	policy->crowded_ns = policy->crowded_ns ? lesser(2 * policy->crowded_ns, HOUR_NS)
+						: CROWDED_NS;
+	policy->spares_ns = now + policy->crowded_ns;
+	return policy->spares_ns;
 }
 
 /* The oldest, but not what a rollback of a hung process would need. */
@@ -445,7 +455,7 @@ bool policy_refill(struct policy *policy, const struct avc_config *config)
 	const bool short_before = policy->room != config->keep;
 
 	policy->room = config->keep;
-	policy_spare_no_more(policy);
+	policy_roomier(policy);
 	return short_before && !policy->count && config->interval_ns;
 }
 

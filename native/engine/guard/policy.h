@@ -55,6 +55,8 @@ struct policy {
 	uint64_t held_ns;       /* since when at least one is held                 */
 	uint64_t spared_ns;     /* since its last one was killed there is none for so long */
 	uint64_t resumes_ns;    /* ... until then                                      */
+	uint64_t crowded_ns;    /* for so long there is no spare                       */
+	uint64_t spares_ns;     /* ... until then                                      */
 	/* The last immediate death that was the program's own. */
 	int at_once_status;
 	uint32_t at_once_lineage;
@@ -179,8 +181,11 @@ void policy_drop(struct policy *policy, uint32_t i);
  * one was held for ten seconds, 0; else a second, twice as long each time, at most a minute: where each
  * is killed at once the app pays for it, and gains nothing. */
 uint64_t policy_killed(struct policy *policy, uint64_t now);
-/* What killed them may have gone. */
-void policy_spare_no_more(struct policy *policy);
+/* A spare had to make way for a template, at a limit of processes that we do not know: until when there
+ * is no other one.  For ten seconds, twice as long each time, at most an hour. */
+uint64_t policy_crowded(struct policy *policy, uint64_t now);
+/* There may be room again for what was killed, or had to make way. */
+void policy_roomier(struct policy *policy);
 /* Which one to drop next.  There is at least one. */
 uint32_t policy_dispensable(const struct policy *policy);
 /* Memory is short: from now on holds one fewer than now. */
