@@ -690,8 +690,13 @@ class Daemon:
 
     @staticmethod
     async def _stop(guard: Guard) -> None:
-        """Blocks for as long as a checkpoint that is under way."""
-        await in_own_thread(guard.stop)
+        """Blocks for as long as a checkpoint that is under way: others, too, where there can be no thread for it."""
+        try:
+            stopped = in_own_thread(guard.stop)
+        except RuntimeError:
+            guard.stop()
+        else:
+            await stopped
 
     async def _end(self, watch: Watch) -> None:
         container = watch.container

@@ -12,6 +12,7 @@ import re
 import resource
 import shutil
 import signal
+import socket
 import stat
 import struct
 import subprocess
@@ -28,7 +29,7 @@ from avckpt.errors import SidecarUnreachable
 from avckpt_hooks import precreate
 from avckpt_hooks.shared import protocol
 
-from testkit.cgroups import freezer
+from testkit.cgroups import Cgroup, freezer
 from testkit.family import look
 from testkit.harness import ROOT, avckpt_command, run, take_checkpoint, wait_until
 from testkit.local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, ended, local_sidecar
@@ -351,6 +352,33 @@ def test_descriptors_that_run_out_keep_nobody_from_being_adopted_later(local: Lo
         time.sleep(6)  # it looks every 5 s
     assert "cannot be read, containers may run unprotected: Too many open files" in local.log
     assert local.wait_for(web, state="protected", timeout_s=15)["adopted"]
+
+
+@SHARED
+def test_one_who_asks_while_there_are_no_descriptors_waits(local: LocalSidecar) -> None:
+    with socket.socket(socket.AF_UNIX) as client:
+        with descriptors_left(local, 0):
+            client.connect(str(local.run_dir / "api.sock"))
+            client.sendall(b"GET /v1/info HTTP/1.1\r\nHost: sidecar\r\n\r\n")
+            wait_until(lambda: "out of system resource" in local.log, 10, "it is told")
+            time.sleep(3)
+            assert local.log.count("out of system resource") < 10
+        client.settimeout(10)
+        assert client.recv(4096).startswith(b"HTTP/1.1 200 ")
+
+
+@SHARED
+def test_a_container_that_ends_while_no_thread_can_be_created_has_ended(local: LocalSidecar) -> None:
+    assert local.process is not None
+    web = local.protected("web", SLEEPER)
+    local.wait_for(web, state="protected")
+    with Cgroup(["pids", ""], "pids.max", go="max", wait="1") as tasks:
+        tasks.take(local.process.pid)
+        tasks.wait()
+        os.kill(web.init_pid, signal.SIGKILL)
+        local.wait_for(web, state="ended")
+        tasks.go()
+        local.stop()
 
 
 @SHARED

@@ -24,7 +24,7 @@ from avckpt_hooks.shared.tell import printable
 from avckpt import __version__, engine
 from avckpt.api.openapi import document
 from avckpt.config import Configuration
-from avckpt.containers.listener import bind_socket
+from avckpt.containers.listener import MAX_WAITING, bind_socket
 from avckpt.containers.protected import Protected
 from avckpt.containers.registry import Registry
 from avckpt.errors import (
@@ -132,9 +132,13 @@ class ApiServer:
         return True
 
     async def _listen(self) -> None:
-        self._site = web.SockSite(self._runner, bind_socket(self._path, socket.SOCK_STREAM))
+        listening = bind_socket(self._path, socket.SOCK_STREAM)
+        # asyncio accepts so many at a time; and where descriptors are short, it fails, tells, and tries again
+        # after a second for each of them, all of them at once.
+        self._site = web.SockSite(self._runner, listening, backlog=1)
         self._file = identity(self._path)
         await self._site.start()
+        listening.listen(MAX_WAITING)
 
     async def close(self) -> None:
         """Ends what is under way, within a second, and removes the socket."""

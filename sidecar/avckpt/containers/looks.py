@@ -28,12 +28,15 @@ _under_way: dict[tuple[str, int], tuple[float, asyncio.Future[Any]]] = {}
 async def look(what: str, pid: int, function: Callable[[], T]) -> T:
     """Returns what `function` returns, or raises.  Callers that want the same `what` of `pid` share one call.
 
-    Raises DeadlineMissed when that takes longer than WAIT_S.
+    Raises DeadlineMissed when that takes longer than WAIT_S, or no thread can be created for it.
     """
     loop = asyncio.get_running_loop()
     since, future = _under_way.get((what, pid), (loop.time(), None))
     if future is None or future.get_loop() is not loop:
-        future = in_own_thread(function)
+        try:
+            future = in_own_thread(function)
+        except RuntimeError as error:
+            raise DeadlineMissed(f"its {what} cannot be read: {error}", pid=pid) from None
         entry = _under_way[what, pid] = (since, future)
 
         def forget(_: object) -> None:

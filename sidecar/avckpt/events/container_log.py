@@ -34,7 +34,10 @@ class ContainerLog:
         if has_ended(init_pidfd):  # then the number may be another one's
             os.close(process)
         else:
-            self._under_way = in_own_thread(lambda: _write(process, text))
+            try:
+                self._under_way = in_own_thread(lambda: _write(process, text))
+            except RuntimeError:  # no thread can be created
+                os.close(process)
 
 
 def _write(process: int, text: str) -> None:
