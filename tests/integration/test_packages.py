@@ -71,6 +71,18 @@ def test_the_image_is_built_from_what_is_installed(site: Path, tmp_path: Path) -
     assert installed(tmp_path / "site", "--version") == version
 
 
+def test_a_base_that_is_not_there_is_told_with_what_to_do(site: Path, podman: Podman) -> None:
+    code = (
+        "from avckpt.cli import sidecar_image\nsidecar_image.IMAGE = 'localhost/avckpt-none'\n"
+        "try: sidecar_image.build('localhost/none:1', print)\n"
+        "except sidecar_image.PodmanFailed as error: print(error)"
+    )
+    said = installed(site, code=code)
+    assert "localhost/none:1" in said
+    assert "--base names another image" in said
+    assert podman.run("image", "exists", "localhost/avckpt-none", check=False).status == 1
+
+
 @long
 def test_the_sidecar_is_built_and_started(site: Path, podman: Podman, base_image: str) -> None:
     said = installed(site, "install", "--sidecar", "--base", base_image)

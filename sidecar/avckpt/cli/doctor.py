@@ -305,7 +305,7 @@ def _judge_sidecar(facts: Facts) -> Check:
             "sidecar",
             Status.WARN,
             f"of version {facts.sidecar_version}, this is {avckpt.__version__}",
-            "build its image again and start it anew",
+            "run: sudo avckpt install --sidecar (or build its image again as before, and start it anew)",
         )
     if facts.sidecar_outdated:
         return Check("sidecar", Status.WARN, sidecar_container.OUTDATED, f"run: {run_it(_run_dir())}")

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from avckpt import artifacts
 from avckpt.cli import sidecar_container
-from avckpt.cli.podman import podman
+from avckpt.cli.podman import PodmanFailed, podman
 from avckpt.cli.sidecar_container import IMAGE, NAME
 from avckpt.errors import ConfigError
 
@@ -37,7 +37,12 @@ def build(base: str, say: Callable[[str], None]) -> str:
         if base and _fetch(base, needs, wheels):
             options += ["--volume", f"{wheels}:/wheels:ro"]
         options += ["--network=host", "--label", f"{BUILD_LABEL}={wanted}", "-t", IMAGE]
-        podman("build", *options, str(folder), timeout_s=BUILD_S)
+        try:
+            podman("build", *options, str(folder), timeout_s=BUILD_S)
+        except PodmanFailed as error:
+            raise PodmanFailed(
+                f"{error}; --base names another image to build from, --archive loads a built one"
+            ) from None
     return f"{IMAGE}: built, build {wanted}"
 
 
