@@ -393,24 +393,37 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 	return back;
 }
 
-/* False: not all of them. */
+static bool lacks_holder(const struct process *process)
+{
+	return process->infected && !process->adopts && !process->holder;
+}
+
+static bool hold(struct avc_guard *guard, struct process *process)
+{
+	struct avc_error ignored = { 0 };
+
+	if (process_hold(process, guard->timer, guard->config.freeze_deadline_ns, &ignored) == 0)
+		return true;
+	guard->dying_until_ns = now_ns() + DYING_NS;
+	return false;
+}
+
+/* False: not all have one. */
 static bool hold_all(struct avc_guard *guard)
 {
+	const struct tree *tree = &guard->tree;
+	uint32_t first = 0;
 	bool all = true;
 
+	while (first < tree->processes && !lacks_holder(tree->process[first]))
+		first++;
+	if (first == tree->processes)
+		return true;
 	if (!last_pid_lock(guard->channel.numbers_fd, false))
 		return false;
-	for (uint32_t i = 0; i < guard->tree.processes; i++) {
-		struct process *process = guard->tree.process[i];
-		struct avc_error ignored = { 0 };
-
-		if (process->infected && !process->adopts && !process->holder &&
-		    process_hold(process, guard->timer, guard->config.freeze_deadline_ns,
-				 &ignored)) {
-			guard->dying_until_ns = now_ns() + DYING_NS;
-			all = false;
-		}
-	}
+	for (uint32_t i = first; i < tree->processes; i++)
+		if (lacks_holder(tree->process[i]))
+			all &= hold(guard, tree->process[i]);
 	last_pid_unlock(guard->channel.numbers_fd);
 	return all;
 }
@@ -555,6 +568,9 @@ static void restore_dead(struct avc_guard *guard, const struct avc_report *repor
 		guard_drop_newer(guard, guard->restore_generation);
 	guard_begin_patience(guard);
 	ready_helper(guard);
+	/* They may lack holders since a restore just before: the last chance for what only they have
+	 * open. */
+	(void)hold_all(guard);
 	kill_descendants(guard);
 	await_killed_holder(guard);
 	if (end_leftovers(guard, report, &error)) {
