@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -15,6 +16,7 @@ from typing import Any
 import pytest
 import yaml
 from avckpt.cli.compose.manifest import COMPOSE_NAMES, Kind, check, files_meant
+from avckpt.cli.compose.podman_compose import STUCK_S
 from avckpt.cli.install import LIBEXEC
 
 from testkit.harness import (
@@ -22,6 +24,7 @@ from testkit.harness import (
     CONFIG,
     OF_A_TEST,
     ROOT,
+    SLOWNESS,
     Completed,
     Container,
     Podman,
@@ -32,10 +35,10 @@ from testkit.harness import (
 )
 
 COUNT = "import itertools, time\nfor i in itertools.count():\n  print('n', i, flush=True); time.sleep(0.02)\n"
-PATIENCE_S = 300.0
+PATIENCE_S = 300.0 * SLOWNESS
 """For a command that brings several containers up on a busy machine."""
 pytestmark = [
-    pytest.mark.timeout(900),
+    pytest.mark.timeout(900 * SLOWNESS),
     pytest.mark.shared_machine(
         "podman-compose is ended when it seems to hang, and containers are given a time to be protected"
     ),
@@ -75,9 +78,10 @@ class Project:
         self.path.with_name("count.py").write_text(COUNT)
 
     def avckpt(self, command: str, *args: str, check: bool = True, env: dict[str, str] | None = None) -> Completed:
-        return run(
-            [*avckpt_command(), command, "-f", str(self.path), *args], check=check, env=env, timeout_s=PATIENCE_S
-        )
+        words = [*avckpt_command(), command, "-f", str(self.path)]
+        if command == "up":
+            words += ["--wait", str(30 * SLOWNESS)]
+        return run([*words, *args], check=check, env=env, timeout_s=PATIENCE_S)
 
     def compose(self, *args: str, check: bool = True) -> Completed:
         return run(
@@ -159,7 +163,7 @@ def test_a_change_makes_only_what_hangs_on_it_anew(project: Project, sidecar: Si
         return {entry["service"]: entry["id"] for entry in json.loads(done.stdout)}
 
     first = up(1)
-    wait_until(lambda: project.container("job").status == "exited", 20, "the job is done")
+    wait_until(lambda: project.container("job").status == "exited", 20 * SLOWNESS, "the job is done")
     assert up(1) == first
     second = up(2)
     assert {service for service in first if first[service] != second[service]} == {"by-map", "by-list", "job"}
@@ -326,6 +330,19 @@ def test_a_dependency_that_does_not_start_hangs_nobody(project: Project) -> None
     assert project.container("by-map").status == "running"
 
 
+def test_a_podman_that_is_slow_hangs_nobody(project: Project, tmp_path: Path) -> None:
+    """What is waited for has been running for long, when a busy machine's Podman at last looks."""
+    plain = f"image: {BASE_IMAGE}, network_mode: host, stop_grace_period: 0s, command: sleep 100"
+    project.write(f"services: {{first: {{{plain}}}, second: {{depends_on: [first], {plain}}}}}")
+    slow = tmp_path / "slow" / "podman"
+    slow.parent.mkdir()
+    waits = f'case "$*" in *--condition=running*) sleep {3 * STUCK_S};; esac'
+    slow.write_text(f'#!/bin/sh\n{waits}\nexec {shutil.which("podman")} "$@"\n')
+    slow.chmod(0o755)
+    project.avckpt("up", env={"PATH": f"{slow.parent}:{os.environ['PATH']}"})
+    assert project.container("second").status == "running"
+
+
 def test_hooks_are_installed_only_when_asked_for(project: Project, sidecar: Sidecar) -> None:
     project.write(SERVICES)
     sidecar.avckpt("uninstall")
@@ -377,7 +394,7 @@ def test_the_sidecar_is_started_and_reads_the_machines_configuration(project: Pr
         assert by_map["automatic"]
         CONFIG.write_text(f"{OF_A_TEST}defaults:\n  keep: 5\n")
         project.podman.run("kill", "--signal", "HUP", "avckpt-sidecar")
-        wait_until(lambda: "config.yaml was read" in sidecar.logs(), 5, "the sidecar has read it")
+        wait_until(lambda: "config.yaml was read" in sidecar.logs(), 5 * SLOWNESS, "the sidecar has read it")
     finally:
         CONFIG.unlink(missing_ok=True)
         sidecar.restart()
@@ -409,8 +426,8 @@ def test_the_example_goes_on_through_crashes(project: Project, sidecar: Sidecar,
     assert states(done) == {"monitor": True, "filter": True, "source": False}
     names = {entry["service"]: entry["name"] for entry in json.loads(done.stdout)}
     monitor, smooth = (Container(project.podman, names[name], "") for name in ("monitor", "filter"))
-    log = monitor.wait_for_log("the filter CRASHED and went on", 60, count=2)
-    monitor.wait_for_log("readings", 20, count=log.count("readings") + 1)
+    log = monitor.wait_for_log("the filter CRASHED and went on", 60 * SLOWNESS, count=2)
+    monitor.wait_for_log("readings", 20 * SLOWNESS, count=log.count("readings") + 1)
     assert smooth.logs().count("started as PID") == 1
     assert "hung up" not in monitor.logs()
     project.avckpt("down", env=ports)
@@ -443,15 +460,15 @@ def test_the_example_of_a_group_agrees_after_crashes(
         lines = {row["line"] for row in rows()}
         return int(lines.pop()) if len(lines) == 1 else 0
 
-    log = members[1].wait_for_log("and they agree", 60)
+    log = members[1].wait_for_log("and they agree", 60 * SLOWNESS)
     for restores, victim in enumerate(members, 1):
         before = line()
-        wait_until(lambda: line() > before, 30, "a line of both")  # noqa: B023
+        wait_until(lambda: line() > before, 30 * SLOWNESS, "a line of both")  # noqa: B023
         os.kill(sidecar.app_pid(victim), signal.SIGKILL)
         for member in members:
             sidecar.wait_restores(member, restores)
         assert {row["group"] for row in rows()} == {project.name}
-        log = members[1].wait_for_log("and they agree", 30, count=log.count("and they agree") + 2)
+        log = members[1].wait_for_log("and they agree", 30 * SLOWNESS, count=log.count("and they agree") + 2)
     assert log.count("planner: connected") == 1
     assert "DISAGREE" not in log
     assert "hung up" not in log

@@ -3,7 +3,8 @@
 
 podman-compose 1.6 waits for a dependency with `podman wait --condition=running`
 and no end: one service that cannot start hangs everything that depends on it.
-While that is all it does, no container will change any more; then it is ended.
+While that is all it does, no container will change any more: if what it waits for does not run,
+it is ended.
 The same goes for `--condition=healthy`, with more patience: where nobody runs
 the health checks, no container ever becomes healthy.
 """
@@ -219,8 +220,16 @@ def _watch(process: subprocess.Popen[bytes], look: Callable[[], None]) -> list[s
         waiting_since = waiting_since or now
         patience_s = UNHEALTHY_S if _HEALTHY in awaited.values() else STUCK_S
         if now - waiting_since > patience_s:
-            names = sorted(f"{name} to become {_WAITS[awaited[name]]}" for name in awaited)
-            return names or ["a container that does not exist"]
+            # A Podman that is slow to answer, the machine being busy, waits for one that has been running for long.
+            unmet = sorted(name for name in awaited if awaited[name] == _HEALTHY or not _runs(name))
+            if unmet or not awaited:
+                names = [f"{name} to become {_WAITS[awaited[name]]}" for name in unmet]
+                return names or ["a container that does not exist"]
+            waiting_since, awaited = None, {}
+
+
+def _runs(name: str) -> bool:
+    return podman("container", "inspect", "--format", "{{.State.Running}}", name, check=False).stdout.strip() == "true"
 
 
 def _awaited(pid: int) -> dict[str, str] | None:
