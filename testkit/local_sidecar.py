@@ -22,7 +22,7 @@ from avckpt.errors import SidecarUnreachable
 from avckpt_hooks import VERSION
 
 from testkit.forked import Forked, preload
-from testkit.harness import ROOT, Completed, Podman, avckpt_command, run, wait_until, write_hooks
+from testkit.harness import ROOT, SLOWNESS, Completed, Podman, avckpt_command, run, wait_until, write_hooks
 from testkit.procfs import children_of, inside
 
 preload("avckpt.daemon")
@@ -58,11 +58,11 @@ class Container:
             ["sh", "-c", '"$@"; exit $?', "sh", sys.executable, str(hooks_source() / "__main__.py"), stage],
             stdin=json.dumps(state),
             env=self.env,
-            timeout_s=10,
+            timeout_s=10 * SLOWNESS,
         )
         return done.stdout + done.stderr
 
-    def status(self, timeout_s: float = 10.0) -> int:
+    def status(self, timeout_s: float = 10.0 * SLOWNESS) -> int:
         """Waits for its end; its exit status."""
         return self.process.wait(timeout_s)
 
@@ -71,7 +71,7 @@ class Container:
         with contextlib.suppress(ProcessLookupError):
             signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
         os.close(self.pidfd)
-        self.process.wait(10)
+        self.process.wait(10 * SLOWNESS)
 
 
 @dataclass
@@ -109,17 +109,17 @@ class LocalSidecar:
                 )
             else:
                 self.process = Forked(_main, ["sidecar", *options], stdin=null.fileno(), stderr=stderr, env=env)
-        wait_until(self._answers, 60, "the sidecar answers")
+        wait_until(self._answers, 60 * SLOWNESS, "the sidecar answers")
 
     def stop(self, signum: int = signal.SIGTERM) -> int:
         """Ends it by a signal; its exit status as subprocess has it."""
         assert self.process is not None
         self.process.send_signal(signum)
-        return self.process.wait(20)
+        return self.process.wait(20 * SLOWNESS)
 
     def avckpt(self, *args: str, check: bool = True) -> Completed:
         """Runs the command line against it."""
-        return run([*avckpt_command(), *args], env=self.env, check=check, timeout_s=60)
+        return run([*avckpt_command(), *args], env=self.env, check=check, timeout_s=60 * SLOWNESS)
 
     @property
     def client(self) -> Client:
@@ -140,7 +140,7 @@ class LocalSidecar:
         ours = (row for row in rows if row["id"] == container.id and row["init_pid"] == container.init_pid)
         return next(ours, {})
 
-    def wait_for(self, container: Container, timeout_s: float = 10.0, **wanted: Any) -> dict[str, Any]:
+    def wait_for(self, container: Container, timeout_s: float = 10.0 * SLOWNESS, **wanted: Any) -> dict[str, Any]:
         """Waits until `avckpt ps -a` shows these values for the container."""
         last: dict[str, Any] = {}
 
@@ -176,10 +176,10 @@ class LocalSidecar:
                 stderr=out if stderr is None else stderr,
                 cwd=ROOT,
             )
-        init_pid = wait_until(lambda: next(iter(children_of(process.pid)), 0), 5, "init starts")
+        init_pid = wait_until(lambda: next(iter(children_of(process.pid)), 0), 5 * SLOWNESS, "init starts")
         pidfd = os.pidfd_open(init_pid)
         if init:
-            wait_until(lambda: children_of(init_pid), 5, "the application starts")
+            wait_until(lambda: children_of(init_pid), 5 * SLOWNESS, "the application starts")
         made = Container(
             container_id or f"{len(self.containers) + 1:x}".rjust(2, "c") * 32,
             name,

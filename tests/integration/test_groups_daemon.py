@@ -18,7 +18,7 @@ import pytest
 from avckpt.artifacts import init_binary
 from avckpt.cli.client import Client
 
-from testkit.harness import ROOT, wait_until
+from testkit.harness import ROOT, SLOWNESS, wait_until
 from testkit.local_sidecar import Container, LocalSidecar, ended
 from testkit.procfs import children_of
 
@@ -70,7 +70,7 @@ def wait_for_line(local: LocalSidecar, members: list[Container], after: int = 0)
         lines = {each["line"] for each in Client(local.run_dir).containers() if each["id"] in ids}
         return lines.pop() if len(lines) == 1 and min(lines) > after else 0
 
-    number: int = wait_until(line, 20, f"a line after {after}; log:\n{local.log}")
+    number: int = wait_until(line, 20 * SLOWNESS, f"a line after {after}; log:\n{local.log}")
     return number
 
 
@@ -84,7 +84,7 @@ def wait_for_restores(local: LocalSidecar, members: list[Container], restores: i
         rows = [row(local, member) for member in members]
         return all(each["restores"] == restores and each["state"] == "protected" for each in rows)
 
-    wait_until(all_back, 10, f"restore {restores}; log:\n{local.log}")
+    wait_until(all_back, 10 * SLOWNESS, f"restore {restores}; log:\n{local.log}")
 
 
 def kill_templates(container: Container) -> int:
@@ -116,7 +116,9 @@ def check_ledgers(ring: list[Container]) -> None:
     wrong = [line for member in ring for line in said(member) if "WRONG" in line or "Traceback" in line]
     assert wrong == []
     before = [tokens(member) for member in ring]
-    wait_until(lambda: all(tokens(each) > had for each, had in zip(ring, before)), 10, f"tokens after {before}")
+    wait_until(
+        lambda: all(tokens(each) > had for each, had in zip(ring, before)), 10 * SLOWNESS, f"tokens after {before}"
+    )
 
 
 def told(local: LocalSidecar, kind: str) -> list[dict[str, Any]]:
@@ -159,7 +161,7 @@ def unit(local: LocalSidecar, name: str, argv: list[str]) -> Container:
     def known() -> list[str]:
         return [each["id"] for each in Client(local.run_dir).containers() if each["init_pid"] == process.pid]
 
-    [identity] = wait_until(known, 20, f"{name} is registered; log:\n{local.log}")
+    [identity] = wait_until(known, 20 * SLOWNESS, f"{name} is registered; log:\n{local.log}")
     member = Container(identity, name, local.env, process, process.pid, os.pidfd_open(process.pid), output)
     local.containers.append(member)
     return member
@@ -195,7 +197,9 @@ def test_all_hurry_until_they_are_back_and_no_longer(local: LocalSidecar, ring: 
         wait_for_restores(local, ring, restores)
         wait_for_line(local, ring, row(local, ring[0])["line"])
         wait_until(
-            lambda: {os.sched_getscheduler(pid) for pid in everybody} == {os.SCHED_OTHER}, 5, "nobody hurries any more"
+            lambda: {os.sched_getscheduler(pid) for pid in everybody} == {os.SCHED_OTHER},
+            5 * SLOWNESS,
+            "nobody hurries any more",
         )
 
 
@@ -207,7 +211,9 @@ def test_all_hurry_from_the_meeting_before_a_freeze_on(local: LocalSidecar, ring
     try:
         # They wait a second for it, with their applications running: longer than any freeze.
         for _ in range(10):
-            wait_until(lambda: os.sched_getscheduler(waiting) == os.SCHED_RR, 5, "a guard waits for another one")
+            wait_until(
+                lambda: os.sched_getscheduler(waiting) == os.SCHED_RR, 5 * SLOWNESS, "a guard waits for another one"
+            )
             hurries = set()
             for _ in range(10):
                 time.sleep(0.02)
@@ -237,7 +243,7 @@ def test_a_guard_that_stops_or_dies_leaves_nobody_stopped(local: LocalSidecar, r
 
 def test_who_ends_by_itself_is_no_member_any_more(local: LocalSidecar, ring: list[Container]) -> None:
     signal.pidfd_send_signal(ring[2].pidfd, signal.SIGTERM)
-    wait_until(lambda: ended(ring[2]), 10, "it ends")
+    wait_until(lambda: ended(ring[2]), 10 * SLOWNESS, "it ends")
     line = row(local, ring[0])["line"]
     left = ring[:2]
     wait_for_line(local, left, line)
@@ -249,7 +255,9 @@ def test_who_ends_by_itself_is_no_member_any_more(local: LocalSidecar, ring: lis
 def test_on_command_all_go_back(local: LocalSidecar, ring: list[Container]) -> None:
     line = wait_for_line(local, ring)
     # On a busy machine somebody may not stop in time.
-    wait_until(lambda: local.avckpt("checkpoint", "member0", check=False).status == 0, 20, "a line on command")
+    wait_until(
+        lambda: local.avckpt("checkpoint", "member0", check=False).status == 0, 20 * SLOWNESS, "a line on command"
+    )
     assert all(row(local, member)["line"] > line for member in ring)
     local.avckpt("restore", "member1")
     wait_for_restores(local, ring, 1)
@@ -261,7 +269,11 @@ def test_without_a_line_nobody_is_killed(local: LocalSidecar) -> None:
     wait_for_line(local, members)
     time.sleep(1.0)  # each of them had a line taken when it came
     # The templates of one member are gone: there is no line that all have.
-    wait_until(lambda: not kill_templates(members[1]) and row(local, members[1])["generations"] == 0, 10, "it is empty")
+    wait_until(
+        lambda: not kill_templates(members[1]) and row(local, members[1])["generations"] == 0,
+        10 * SLOWNESS,
+        "it is empty",
+    )
     survivor = members[1].app_pid
     os.kill(members[0].app_pid, signal.SIGKILL)
     assert members[0].status() == 128 + signal.SIGKILL
@@ -277,7 +289,9 @@ def newest_template(container: Container) -> int:
 def take_line(local: LocalSidecar, members: list[Container]) -> int:
     """On command; on a busy machine somebody may not stop in time."""
     before = row(local, members[0])["line"]
-    wait_until(lambda: local.avckpt("checkpoint", members[0].name, check=False).status == 0, 20, "a line on command")
+    wait_until(
+        lambda: local.avckpt("checkpoint", members[0].name, check=False).status == 0, 20 * SLOWNESS, "a line on command"
+    )
     return wait_for_line(local, members, before)
 
 
@@ -295,7 +309,7 @@ def test_after_a_death_all_keep_the_same_older_line(local: LocalSidecar) -> None
         take_line(local, members)
     # One has lost the newest: there has to be another that all have.
     os.kill(newest_template(members[2]), signal.SIGKILL)
-    wait_until(lambda: row(local, members[2])["generations"] == 1, 10, "it is dropped")
+    wait_until(lambda: row(local, members[2])["generations"] == 1, 10 * SLOWNESS, "it is dropped")
     os.kill(members[1].app_pid, signal.SIGKILL)
     wait_for_restores(local, members, 2)
     assert {row(local, member)["line"] for member in members} == {older}
@@ -339,8 +353,8 @@ def pair(local: LocalSidecar, programs: list[str], go: Path) -> list[Container]:
             "client", ["sh", "-c", 'sleep 1; exec "$@"', "sh", sys.executable, "-uc", programs[1], *arguments], RARELY
         )
     )
-    wait_until(lambda: "SENT" in said(members[1]), 10, "it has sent")
-    wait_until(lambda: local.avckpt("checkpoint", "client", check=False).status == 0, 20, "a line")
+    wait_until(lambda: "SENT" in said(members[1]), 10 * SLOWNESS, "it has sent")
+    wait_until(lambda: local.avckpt("checkpoint", "client", check=False).status == 0, 20 * SLOWNESS, "a line")
     wait_for_line(local, members)
     go.touch()
     return members
@@ -354,7 +368,7 @@ def test_what_was_on_its_way_is_so_again(local: LocalSidecar, tmp_path: Path, vi
     before = said(members[1]).count("ENDED b'!'")
     os.kill(members[victim].app_pid, signal.SIGKILL)
     wait_for_restores(local, members, 1)
-    wait_until(lambda: said(members[1]).count("ENDED b'!'") > before, 20, "it was answered")
+    wait_until(lambda: said(members[1]).count("ENDED b'!'") > before, 20 * SLOWNESS, "it was answered")
     assert set(said(members[0])) == {"GOT True"}
 
 
@@ -399,5 +413,5 @@ time.sleep(1000)
     members = pair(local, [server, client], tmp_path / "go")
     time.sleep(0.5)
     os.kill(members[1].app_pid, signal.SIGKILL)
-    wait_until(lambda: any(line.startswith("RESET") for line in said(members[1])), 20, f"{said(members[1])}")
+    wait_until(lambda: any(line.startswith("RESET") for line in said(members[1])), 20 * SLOWNESS, f"{said(members[1])}")
     wait_until(lambda: any(TOLD[state] in json.dumps(event) for event in told(local, "restored")), 10, TOLD[state])

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from testkit.harness import Container, ContainerFactory, Podman, Sidecar, wait_until
+from testkit.harness import SLOWNESS, Container, ContainerFactory, Podman, Sidecar, wait_until
 
 IMAGE = "localhost/avckpt-ros2:latest"
 RECORD = struct.Struct("<4Q")
@@ -52,12 +52,14 @@ def test_a_dds_pair_goes_on_where_its_line_was(
     def wait_heard(more: int) -> None:
         had = [len(heard(log)) for log in logs]
         wait_until(
-            lambda: all(len(heard(log)) >= n + more for log, n in zip(logs, had)), 60, f"{more} more messages are heard"
+            lambda: all(len(heard(log)) >= n + more for log, n in zip(logs, had)),
+            60 * SLOWNESS,
+            f"{more} more messages are heard",
         )
 
     def wait_line() -> None:
         before = line(node)
-        wait_until(lambda: min(line(node), line(peer)) > before, 30, "a new line of both")
+        wait_until(lambda: min(line(node), line(peer)) > before, 30 * SLOWNESS, "a new line of both")
 
     wait_heard(10)
     for restores in range(1, RESTORES + 1):

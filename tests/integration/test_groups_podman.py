@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from testkit.harness import ROOT, ContainerFactory, Sidecar, wait_until
+from testkit.harness import ROOT, SLOWNESS, ContainerFactory, Sidecar, wait_until
 from testkit.local_sidecar import LocalSidecar, hooked_podman
 from testkit.nodes import app_pid, nodes_of
 
@@ -20,6 +20,7 @@ pytestmark = pytest.mark.shared_machine(
 )
 
 MEMBERS = 3
+PATIENCE_S = 30.0 * SLOWNESS
 
 
 def test_a_ring_of_containers_goes_back_together(sidecar: Sidecar, container: ContainerFactory) -> None:
@@ -41,13 +42,15 @@ def test_a_ring_of_containers_goes_back_together(sidecar: Sidecar, container: Co
         ids = {member.id for member in ring}
         return {row["line"] for row in sidecar.ps() if row["id"] in ids}
 
-    wait_until(lambda: len(lines()) == 1 and min(lines()) > 0, 30, "a line of all")
+    wait_until(lambda: len(lines()) == 1 and min(lines()) > 0, PATIENCE_S, "a line of all")
     for restores in (1, 2):
         os.kill(sidecar.app_pid(ring[restores]), signal.SIGKILL)
         for member in ring:
             sidecar.wait_restores(member, restores)
     had = [len(member.logs().splitlines()) for member in ring]
-    wait_until(lambda: all(len(each.logs().splitlines()) > n + 5 for each, n in zip(ring, had)), 10, "all go on")
+    wait_until(
+        lambda: all(len(each.logs().splitlines()) > n + 5 for each, n in zip(ring, had)), PATIENCE_S, "all go on"
+    )
     assert [line for member in ring for line in member.logs().splitlines() if "WRONG" in line] == []
 
 
@@ -86,17 +89,17 @@ def test_nodes_of_two_containers_go_back_together(local: LocalSidecar, hooked: C
         lines = {row["line"] for row in rows()}
         return len(rows()) == 4 and len(lines) == 1 and min(lines) > 0
 
-    wait_until(have_line, 60, "a line of all four")
+    wait_until(have_line, PATIENCE_S, "a line of all four")
     for restores in range(1, 4):
         os.kill(app_pid(rows()[restores]), signal.SIGKILL)
         wait_until(
             lambda: [(row["restores"], row["state"]) for row in rows()] == [(restores, "protected")] * 4,  # noqa: B023
-            30,
+            PATIENCE_S,
             f"all are back: {rows()}",
         )
-        wait_until(have_line, 30, "a new line of all four")
+        wait_until(have_line, PATIENCE_S, "a new line of all four")
     had = [len(car.logs().splitlines()) for car in cars]
-    wait_until(lambda: all(len(car.logs().splitlines()) > n + 10 for car, n in zip(cars, had)), 20, "all go on")
+    wait_until(lambda: all(len(car.logs().splitlines()) > n + 10 for car, n in zip(cars, had)), PATIENCE_S, "all go on")
     said = [line for car in cars for line in car.logs().splitlines()]
     assert [line for line in said if "WRONG" in line or "ended" in line or "Traceback" in line] == []
     restored = [event for event in local.client.history() if event["kind"] == "restored"]
