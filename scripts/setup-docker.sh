@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # SPDX-License-Identifier: Apache-2.0
 #
-# Debian's docker.io and containerd, unpacked below build/docker for the tests of
+# Debian's docker.io, containerd and runc, unpacked below build/docker for the tests of
 # avckpt-runtime: nothing is installed, no service is started.  Elsewhere than on
 # Debian or Ubuntu, and without a way to the packages, those tests are skipped.
 
@@ -13,11 +13,12 @@ ROOT_DIR=$BUILD/docker/root
 have apt-get || { note "no apt-get: the tests of Docker are skipped"; exit 0; }
 
 unpack() {
-	local folder
+	local folder more
 	folder=$(mktemp -d) || return
 	chmod 0755 "$folder" || return
-	(cd "$folder" && apt-get download docker.io containerd tini "$(apt-cache depends docker.io |
-		sed -n 's/.*Depends: \(libdevmapper[^ ]*\)/\1/p' | head -n 1)") || return
+	# Debian 12's needs a library, and Debian 13's has the command in a package of its own.
+	mapfile -t more < <(apt-cache depends docker.io | sed -n 's/.*: \(libdevmapper.*\|docker-cli\)$/\1/p')
+	(cd "$folder" && apt-get download docker.io containerd runc tini "${more[@]}") || return
 	rm -rf "$BUILD/docker.new" && mkdir -p "$BUILD/docker.new" || return
 	for deb in "$folder"/*.deb; do dpkg -x "$deb" "$BUILD/docker.new/root" || return; done
 	rm -rf "$folder" "$BUILD/docker" || return
