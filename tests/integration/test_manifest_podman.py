@@ -205,6 +205,21 @@ def test_what_another_manifest_of_the_project_started_stays(project: Project) ->
     assert not project.ids()
 
 
+def test_what_podman_does_not_remove_is_a_failure(project: Project, podman: Podman) -> None:
+    plain = f"image: {BASE_IMAGE}, network_mode: host, stop_grace_period: 0s, command: sleep 100"
+    project.write(f"services: {{first: {{{plain}}}, second: {{{plain}}}}}")
+    project.avckpt("up")
+    first = project.container("first")
+    podman.run("pause", first.name)
+    done = project.avckpt("down", check=False)
+    assert done.status == 1
+    assert done.stderr.splitlines()[-1].startswith(f"avckpt: {first.name} not removed: ")
+    assert project.ids() == [first.id]
+    podman.run("unpause", first.name)
+    project.avckpt("down")
+    assert project.ids() == []
+
+
 @pytest.mark.parametrize("policy", ["never", "missing"])
 def test_an_image_that_is_missing_changes_nothing(podman: Podman, tmp_path: Path, policy: str) -> None:
     """podman-compose removes what runs before it finds out."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from avckpt.errors import ConfigError, Denied, ExitCode
+from avckpt.errors import AvckptError, ConfigError, Denied, ExitCode
 
 if TYPE_CHECKING:
     from avckpt.cli.compose.manifest import Manifest
@@ -155,8 +155,13 @@ def down(
         raise Denied("protected containers are those of root's Podman: use sudo")
     compose = Compose(paths, project, profiles=profiles, env_file=env_file)
     before = compose.containers() if as_json else []
-    compose.down(services, volumes, _say)
-    staying = compose.containers() if as_json or not services else []
+    complaint = compose.down(services, volumes, _say)
+    staying = compose.containers()
+    if staying and complaint:
+        meant = services or compose.services()
+        names = ", ".join(sorted(one.name for one in staying if one.service in meant))
+        if names:
+            raise AvckptError(f"{names} not removed: {complaint.removeprefix('Error: ')}")
     if staying and not services:
         names = ", ".join(sorted(one.name for one in staying))
         _say(f"{names}: of another manifest of this project; stays, with the project's pod and networks")

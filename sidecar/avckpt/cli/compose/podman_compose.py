@@ -119,9 +119,9 @@ class Compose:
         if failures:
             raise AvckptError(f"{'; '.join(failures)}: build it, or correct its name; nothing was started or stopped")
 
-    def down(self, services: Sequence[str], volumes: bool, say: Say) -> None:
-        """`down`.  Raises AvckptError when it fails."""
-        self._run(["down", *(["--volumes"] if volumes else []), *services], say)
+    def down(self, services: Sequence[str], volumes: bool, say: Say) -> str:
+        """`down`.  Returns and raises as `up` does: it ends with 0 also where Podman refuses to remove a container."""
+        return self._run(["down", *(["--volumes"] if volumes else []), *services], say)
 
     def services(self) -> list[str]:
         """Those that `up` would start; not those of a profile that nobody asks for.  Raises AvckptError."""
