@@ -111,6 +111,6 @@ disk() { printf -- '-drive\nfile=%s,format=raw,if=virtio,cache=unsafe,snapshot=o
 mapfile -t disks < <(disk "$DISK" && disk "$MACHINE/checkout.disk")
 timeout --foreground "$LIMIT" qemu-system-x86_64 -accel tcg,thread=multi -cpu max -smp "${CPUS:-2}" -m "${MEMORY:-6G}" \
 	-display none -no-reboot -kernel "$MACHINE/$KERNEL/vmlinuz" -initrd "$MACHINE/$KERNEL/initrd" \
-	-append "root=/dev/vda rw console=ttyS0 panic=1 systemd.setenv=AVCKPT_LONG=${AVCKPT_LONG:-}" "${disks[@]}" \
+	-append "root=/dev/vda rw console=ttyS0 panic=1 systemd.default_device_timeout_sec=3600 systemd.setenv=AVCKPT_LONG=${AVCKPT_LONG:-}" "${disks[@]}" \
 	-nic user,model=virtio-net-pci -serial "file:$LOGS/machine-$KERNEL.console" -serial stdio </dev/null | sed -u 's/\r$//' | tee "$log" || true
 grep -q '^machine: ended with 0$' "$log" || die "the tests did not pass on the kernel of $KERNEL ($(tail -n 1 "$log"))"

@@ -46,6 +46,9 @@ while True:
     if os.path.exists("/app/hang"):
         print("hangs", flush=True)
         time.sleep(1e6)
+    if os.path.exists("/app/leak") and not os.path.exists("/dev/shm/leaked"):
+        open("/dev/shm/leaked", "w").close()  # once, also when it has gone back
+        leaked = b"x" * (1 << 30)
     time.sleep(0.2)
 """
 
@@ -78,6 +81,8 @@ HealthTimeout=60s
 HealthRetries=2
 """
 """Podman and the sidecar both run it; it notices within five intervals that there are no signs of life."""
+
+LIMITED = "PodmanArgs=--memory=120m --memory-swap=120m"
 
 
 def systemctl(*args: str) -> str:
@@ -131,11 +136,15 @@ def service(sidecar_unit: Sidecar, podman: Podman, tmp_path: Path) -> Iterator[C
     UNITS.mkdir(parents=True, exist_ok=True)
     made: list[Service] = []
 
-    def start(most: int = KILLS + 1, container: str = "", watchdog_s: float = 0) -> Service:
+    def start(most: int = KILLS + 1, container: str = "", watchdog_s: float = 0, more: str = "") -> Service:
         name = f"avckpt-quadlet-{os.getpid()}-{next(NUMBERS)}"
         (UNITS / f"{name}.container").write_text(
             UNIT.format(
-                name=name, folder=tmp_path, most=most, container=container, service=f"WatchdogSec={watchdog_s:g}"
+                name=name,
+                folder=tmp_path,
+                most=most,
+                container=container,
+                service=f"WatchdogSec={watchdog_s:g}\n{more}",
             )
         )
         made.append(Service(podman, name, ""))
@@ -241,6 +250,23 @@ def test_systemds_watchdog_restarts_what_nobody_else_notices(
     sidecar_unit.wait_generation(one, 1, PATIENCE_S)
     assert [row["id"] for row in sidecar_unit.ps()] == [one.id]
     assert "restored in" not in journal(one.unit, "--identifier=avckpt")
+
+
+def test_a_unit_that_is_to_end_when_memory_is_short_does(
+    service: Callable[..., Service], sidecar_unit: Sidecar, tmp_path: Path
+) -> None:
+    """systemd sees that one of its processes was killed, and asks nobody whether that has been undone."""
+    one = service(container=LIMITED, more="OOMPolicy=kill")
+    first = one.id
+    sidecar_unit.wait_generation(one, 1, PATIENCE_S)
+    (tmp_path / "leak").touch()
+    wait_until(lambda: one.shown("NRestarts") != "0", PATIENCE_S, "systemd has ended it", every_s=0.1)
+    (tmp_path / "leak").unlink()
+    wait_until(lambda: one.shown("ActiveState") == "active", PATIENCE_S, "it is started anew", every_s=0.5)
+    assert "'oom-kill'" in journal(one.unit)
+    one.id = one.inspect()["Id"]
+    assert one.id != first
+    sidecar_unit.wait_generation(one, 1, PATIENCE_S)
 
 
 def test_stopping_a_unit_is_no_crash(service: Callable[..., Service], sidecar_unit: Sidecar) -> None:
