@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from testkit.harness import SLOWNESS, Container, Podman, Sidecar, avckpt_command, run, wait_until
+from testkit.harness import SLOWNESS, Container, Podman, Sidecar, avckpt_command, run, take_checkpoint, wait_until
 
 GENERATOR = Path("/usr/lib/systemd/system-generators/podman-system-generator")
 UNITS = Path("/run/containers/systemd")
@@ -250,6 +250,21 @@ def test_systemds_watchdog_restarts_what_nobody_else_notices(
     sidecar_unit.wait_generation(one, 1, PATIENCE_S)
     assert [row["id"] for row in sidecar_unit.ps()] == [one.id]
     assert "restored in" not in journal(one.unit, "--identifier=avckpt")
+
+
+def test_a_kill_for_memory_is_no_restart(
+    service: Callable[..., Service], sidecar_unit: Sidecar, tmp_path: Path
+) -> None:
+    """The image is of before the leak: one of its middle would be killed again at once, as often as may be."""
+    one = service(container=f"{LIMITED}\nLabel=avckpt.interval=1h")
+    take_checkpoint(sidecar_unit.client, one.name, PATIENCE_S)
+    (tmp_path / "leak").touch()
+    sidecar_unit.wait_restores(one, 1, PATIENCE_S)
+    counted = one.counted
+    wait_until(lambda: one.counted > counted + 10, PATIENCE_S, "it counts on", every_s=0.5)
+    assert one.shown("NRestarts") == "0"
+    assert one.inspect()["Id"] == one.id
+    assert [row["restores"] for row in sidecar_unit.ps()] == [1]
 
 
 def test_a_unit_that_is_to_end_when_memory_is_short_does(
