@@ -16,6 +16,7 @@
 #define ENDS_NS (20 * NS_PER_MS)
 #define HOLD_AGAIN_NS (10 * NS_PER_MS) /* twice as long each time */
 #define HOLD_TRIES 8
+#define HOLD_LAST_NS (100 * NS_PER_MS) /* while init waits */
 #define ROOM_STEP_US 10000
 
 /* ---- death and restore --------------------------------------------------------- */
@@ -408,8 +409,8 @@ static bool hold(struct avc_guard *guard, struct process *process)
 	return false;
 }
 
-/* False: not all have one. */
-static bool hold_all(struct avc_guard *guard)
+/* Begins with none after end_ns.  False: not all have one. */
+static bool hold_all(struct avc_guard *guard, uint64_t end_ns)
 {
 	const struct tree *tree = &guard->tree;
 	uint32_t first = 0;
@@ -423,7 +424,7 @@ static bool hold_all(struct avc_guard *guard)
 		return false;
 	for (uint32_t i = first; i < tree->processes; i++)
 		if (lacks_holder(tree->process[i]))
-			all &= hold(guard, tree->process[i]);
+			all &= now_ns() < end_ns && hold(guard, tree->process[i]);
 	last_pid_unlock(guard->channel.numbers_fd);
 	return all;
 }
@@ -434,7 +435,7 @@ void guard_hold_missing(struct avc_guard *guard)
 	/* What has not stopped yet would not do so for this either. */
 	if (guard_tend_stragglers(guard))
 		return;
-	if (hold_all(guard) || !guard->count || ++guard->hold_tries == HOLD_TRIES)
+	if (hold_all(guard, UINT64_MAX) || !guard->count || ++guard->hold_tries == HOLD_TRIES)
 		guard->hold_ns = UINT64_MAX;
 	else
 		guard->hold_ns = now_ns() + (HOLD_AGAIN_NS << guard->hold_tries);
@@ -570,7 +571,7 @@ static void restore_dead(struct avc_guard *guard, const struct avc_report *repor
 	ready_helper(guard);
 	/* They may lack holders since a restore just before: the last chance for what only they have
 	 * open. */
-	(void)hold_all(guard);
+	(void)hold_all(guard, now_ns() + HOLD_LAST_NS);
 	kill_descendants(guard);
 	await_killed_holder(guard);
 	if (end_leftovers(guard, report, &error)) {
