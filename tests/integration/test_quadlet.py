@@ -63,7 +63,7 @@ Pull=never
 Notify=true
 Label=avckpt.enable=true
 Label=avckpt.interval=300ms
-Label=avckpt.restore.max={most}/1h
+Label=avckpt.restore.max={restores}
 {container}
 
 [Service]
@@ -136,13 +136,13 @@ def service(sidecar_unit: Sidecar, podman: Podman, tmp_path: Path) -> Iterator[C
     UNITS.mkdir(parents=True, exist_ok=True)
     made: list[Service] = []
 
-    def start(most: int = KILLS + 1, container: str = "", watchdog_s: float = 0, more: str = "") -> Service:
+    def start(restores: str = "64/1s", container: str = "", watchdog_s: float = 0, more: str = "") -> Service:
         name = f"avckpt-quadlet-{os.getpid()}-{next(NUMBERS)}"
         (UNITS / f"{name}.container").write_text(
             UNIT.format(
                 name=name,
                 folder=tmp_path,
-                most=most,
+                restores=restores,
                 container=container,
                 service=f"WatchdogSec={watchdog_s:g}\n{more}",
             )
@@ -193,7 +193,7 @@ def test_crashes_are_no_restarts(service: Callable[..., Service], sidecar_unit: 
 
 def test_systemd_restarts_what_is_not_undone(service: Callable[..., Service], sidecar_unit: Sidecar) -> None:
     """`Restart=` is for what avckpt leaves, and the new container is protected again."""
-    one = service(1)
+    one = service("1/1h")
     first = one.id
     sidecar_unit.wait_generation(one, 1, PATIENCE_S)
     # One restore, and one more from each older generation (docs/policy.md), before it gives up.
