@@ -14,8 +14,8 @@
 #define HOLDER_NS (1 * NS_PER_S) /* busy machines */
 #define INIT_LOOK_NS (50 * NS_PER_MS)
 #define ENDS_NS (20 * NS_PER_MS)
-#define HOLD_AGAIN_NS (10 * NS_PER_MS) /* twice as long each time */
-#define HOLD_TRIES 8
+#define HOLD_AGAIN_NS (20 * NS_PER_MS) /* twice as long each time */
+#define HOLD_TRIES 7
 #define HOLD_LAST_NS (100 * NS_PER_MS) /* while init waits */
 #define ROOM_STEP_US 10000
 
@@ -435,10 +435,10 @@ void guard_hold_missing(struct avc_guard *guard)
 	/* What has not stopped yet would not do so for this either. */
 	if (guard_tend_stragglers(guard))
 		return;
-	if (hold_all(guard, UINT64_MAX) || !guard->count || ++guard->hold_tries == HOLD_TRIES)
+	if (hold_all(guard, UINT64_MAX) || !guard->count || guard->hold_tries == HOLD_TRIES)
 		guard->hold_ns = UINT64_MAX;
 	else
-		guard->hold_ns = now_ns() + (HOLD_AGAIN_NS << guard->hold_tries);
+		guard->hold_ns = now_ns() + (HOLD_AGAIN_NS << guard->hold_tries++);
 }
 
 /* Only holders keep open what the other processes have open.  The next checkpoint would make those that
