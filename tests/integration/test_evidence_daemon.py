@@ -151,7 +151,7 @@ def test_deaths_fill_no_log(sidecar: LocalSidecar) -> None:
         return "left out here" in sidecar.log
 
     begun = time.monotonic()
-    wait_until(is_cut_short, 60, "it has had enough lines", every_s=0.01)
+    wait_until(is_cut_short, 90, "it has had enough lines", every_s=0.01)
     lines = sum("victim: " in line for line in sidecar.log.splitlines())
     assert lines <= AT_ONCE + (time.monotonic() - begun) / EACH_S * 1.5 + 1
     # None of them is missing in the history, of which half is its own.

@@ -10,9 +10,9 @@ from avckpt.bucket import Bucket
 
 log = logging.getLogger("avckpt")
 
-AT_ONCE = 400
-"""A container, with its nodes, has so many lines at once: a launcher of 128 nodes can start and lose all of
-them, ..."""
+AT_ONCE = 700
+"""A container, with its nodes, has so many lines at once: each of 200 crashes is told in three, and a launcher of
+128 nodes can start and lose all of them, ..."""
 EACH_S = 1.0
 """... and then one in this time, however often it is started again."""
 
