@@ -16,10 +16,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from avckpt.guard import Images
+from avckpt.guard import Files, GuardConfig, Images
 
 from testkit.guarded import WHERE, GuardProcess, Victim, config, injected
+from testkit.scenario import disturb, wait_looked
 
+ENDS = ("restored", "gave_up")
 KINDS_OF_LOSS = ("dropped", "unprotected", "gave_up")
 MOMENT_S = 0.1
 FEW = 16
@@ -29,6 +31,7 @@ LEVELS = 8
 
 
 OPENERS = "openat,pidfd_open,pidfd_getfd,memfd_create,socket"
+MAKERS = f"{OPENERS},openat2,socketpair,pipe2,epoll_create1,eventfd2,timerfd_create"
 
 
 @pytest.fixture(autouse=True)
@@ -107,7 +110,7 @@ def test_a_death_while_there_are_no_descriptors(limit: int, where: str, tmp_path
         with limited(guard, resource.RLIMIT_NOFILE, limit):
             victim.kill_app()
             time.sleep(MOMENT_S)
-        event = guard.wait_for(lambda event: event.get("kind") in ("restored", "gave_up"), "end of the restore")
+        event = guard.wait_for(lambda event: event.get("kind") in ENDS, "end of the restore")
         assert event["kind"] == "restored", event
         assert event["generation"] == taken["generation"]
         assert not losses(guard)
@@ -165,3 +168,59 @@ def test_each_descriptor_is_not_to_be_had_once(command: str, images: Images, fir
             assert guard.checkpoint()["kind"] == "checkpoint", failed
         assert n > LEVELS
         victim.wait_beats()
+
+
+def check_each_is_lacking_once(victim: Victim, settings: GuardConfig, error: str, *, disturbs: bool) -> None:
+    """Each thing that is opened during a restore: nothing is restored around it, and another try finds it all."""
+    log = victim.board.path.with_suffix(".log")
+    with GuardProcess(settings, [victim.pid]) as guard:
+        for n in itertools.count(1):
+            guard.checkpoint()
+            if disturbs:
+                disturb(victim)
+            since, before = guard.mark(), victim.see().counter[1]
+            with injected(guard, MAKERS, f"error={error}:when={n}", log):
+                victim.kill_app()
+                event = guard.wait_for(lambda event: event.get("kind") in ENDS, "end of the restore", since=since)
+            failed = [line for line in log.read_text().splitlines() if "INJECTED" in line]
+            if not failed:
+                break
+            # An older generation is as good: only then does the error say that something was lacking.
+            assert event["kind"] == "restored", (event, failed)
+            said = event.get("error", {"kind": "kernel", "errno": getattr(errno, error)})
+            assert (said["kind"], said["errno"]) == ("kernel", getattr(errno, error)), (event, failed)
+            if disturbs:
+                wait_looked(victim, before)
+            else:
+                victim.wait_beats()
+        assert n > LEVELS
+
+
+@pytest.mark.parametrize(
+    ("command", "error"),
+    [
+        *(("tree 2", error) for error in ("EMFILE", "ENFILE", "ENOMEM")),
+        ("idle 1 2 --in-child", "EMFILE"),
+    ],
+)
+def test_each_descriptor_is_not_to_be_had_once_in_a_restore(command: str, error: str, tmp_path: Path) -> None:
+    with Victim(command, tmp_path) as victim:
+        check_each_is_lacking_once(victim, config(), error, disturbs=False)
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        *("descriptors closed", "descriptors content", "descriptors epoll"),
+        *("events timers", "sockets messages", "sockets shut"),
+    ],
+)
+def test_each_is_not_to_be_had_once_where_much_is_put_back(scenario: str, tmp_path: Path) -> None:
+    with Victim(f"{scenario} {tmp_path}", tmp_path) as victim:
+        check_each_is_lacking_once(victim, config(), "EMFILE", disturbs=True)
+
+
+@pytest.mark.parametrize("files", [Files.STRICT, Files.AUTO])
+def test_a_file_that_cannot_be_looked_at_once_was_not_written(files: Files, tmp_path: Path, memory: Path) -> None:
+    with Victim(f"descriptors quiet {tmp_path}", memory) as victim:
+        check_each_is_lacking_once(victim, config(files=files), "EMFILE", disturbs=False)

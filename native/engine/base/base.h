@@ -74,6 +74,16 @@ int fail_memory(struct avc_error *err, pid_t pid, const char *operation);
 /* Whether it means that we, or the machine, have no descriptors or memory left: which says nothing
  * about the process that was looked at. */
 bool is_shortage(int errnum);
+/* What a call has returned that opens (-1, errno), or allocates (NULL), as it is.  A shortage is remembered
+ * until shortage_begin(), because most callers do without what they do not get. */
+int got_fd(int fd);
+void *got_memory(void *memory);
+/* The same where the errno may also mean a limit of the user's (inotify(7)), or whatever a driver wants:
+ * only if there is no other descriptor, either. */
+int got_limited_fd(int fd);
+void shortage_begin(void);
+/* -1 if there was one since: *err says so, whatever it has said of what followed. */
+int shortage_check(struct avc_error *err, const char *operation) warn_unused;
 uint64_t now_ns(void);
 struct timespec timespec_of(uint64_t ns);
 uint64_t timespec_ns(const struct timespec *t);
@@ -403,6 +413,8 @@ struct fd_path fd_path(int fd);
 /* Another open file description of that.  With O_NONBLOCK: there may be no process at the other end
  * of a pipe. */
 int open_again(int fd, int flags);
+/* The same of a device. */
+int open_device(int fd, int flags);
 /* The id of the mount by which it was opened, as in mountinfo; 0: unknown. */
 uint64_t mount_of(int fd);
 /* Whether a file system of that type asks a server, or a program (FUSE), which may not answer, or be

@@ -4,6 +4,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/eventfd.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -48,6 +49,43 @@ bool is_shortage(int errnum)
 	return errnum == EMFILE || errnum == ENFILE || errnum == ENOMEM;
 }
 
+static int lacking; /* the errno; threads that help set it, too */
+
+static void remember(int errnum)
+{
+	if (is_shortage(errnum))
+		__atomic_store_n(&lacking, errnum, __ATOMIC_RELAXED);
+}
+
+int got_fd(int fd)
+{
+	if (fd < 0)
+		remember(errno);
+	return fd;
+}
+
+void *got_memory(void *memory)
+{
+	if (!memory)
+		remember(errno);
+	return memory;
+}
+
+int got_limited_fd(int fd)
+{
+	const int errnum = errno;
+	int other = fd < 0 && is_shortage(errnum) ? got_fd(eventfd(0, EFD_CLOEXEC)) : -1;
+
+	close_fd(&other);
+	errno = errnum;
+	return fd;
+}
+
+void shortage_begin(void)
+{
+	__atomic_store_n(&lacking, 0, __ATOMIC_RELAXED);
+}
+
 static const char *shortage(int errnum)
 {
 	switch (errnum) {
@@ -60,8 +98,19 @@ static const char *shortage(int errnum)
 	}
 }
 
+int shortage_check(struct avc_error *err, const char *operation)
+{
+	const int errnum = __atomic_load_n(&lacking, __ATOMIC_RELAXED);
+
+	if (!errnum)
+		return 0;
+	*err = (struct avc_error){ 0 };
+	return fail(err, AVC_KERNEL, errnum, 0, operation, "", "%s", shortage(errnum));
+}
+
 int fail_memory(struct avc_error *err, pid_t pid, const char *operation)
 {
+	remember(ENOMEM);
 	return fail(err, AVC_KERNEL, ENOMEM, pid, operation, "malloc", "%s", shortage(ENOMEM));
 }
 
@@ -72,6 +121,7 @@ int fail_errno(struct avc_error *err, pid_t pid, const char *operation, const ch
 	enum avc_code code = AVC_KERNEL;
 	va_list args;
 
+	remember(errnum);
 	if (is_shortage(errnum))
 		return fail(err, code, errnum, pid, operation, syscall, "%s", shortage(errnum));
 	/* For a process that has just been reaped, Yama (ptrace_scope 1, as on Ubuntu) returns

@@ -27,7 +27,7 @@ int open_below(int root, const char *path, uint64_t flags, uint64_t resolve)
 		.resolve = RESOLVE_IN_ROOT | RESOLVE_NO_MAGICLINKS | resolve,
 	};
 
-	return (int)syscall(SYS_openat2, root, path, &how, sizeof how);
+	return got_fd((int)syscall(SYS_openat2, root, path, &how, sizeof how));
 }
 
 int open_in_root_of(pid_t pid, const char *path, uint64_t flags)
@@ -51,7 +51,12 @@ struct fd_path fd_path(int fd)
 
 int open_again(int fd, int flags)
 {
-	return open(fd_path(fd).text, flags | O_NONBLOCK | O_NOCTTY | O_CLOEXEC);
+	return got_fd(open(fd_path(fd).text, flags | O_NONBLOCK | O_NOCTTY | O_CLOEXEC));
+}
+
+int open_device(int fd, int flags)
+{
+	return got_limited_fd(open(fd_path(fd).text, flags | O_NONBLOCK | O_NOCTTY | O_CLOEXEC));
 }
 
 /* ---- file systems ------------------------------------------------------------------------- */
@@ -188,7 +193,7 @@ static void read_leases(struct leases *leases)
 	char *line = NULL;
 	size_t size = 0;
 	unsigned long inode;
-	FILE *locks = fopen("/proc/locks", "re");
+	FILE *locks = got_memory(fopen("/proc/locks", "re"));
 
 	leases->known = locks != NULL;
 	while (leases->known && getline(&line, &size, locks) > 0) {

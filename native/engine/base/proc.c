@@ -27,7 +27,7 @@ int proc_open(pid_t pid, const char *name, int flags)
 	char path[96];
 
 	snprintf(path, sizeof path, "/proc/%d/%s", pid, name);
-	return open(path, flags | O_CLOEXEC);
+	return got_fd(open(path, flags | O_CLOEXEC));
 }
 
 struct mapped_path {
@@ -56,7 +56,7 @@ int proc_open_mapped(pid_t pid, avc_remote start, avc_remote end, int flags)
 		errno = EACCES;
 		return -1;
 	}
-	return open(mapped_path(pid, start, end).text, flags | O_CLOEXEC);
+	return got_fd(open(mapped_path(pid, start, end).text, flags | O_CLOEXEC));
 }
 
 /* Reads from the start, even if it was read before; the result is terminated. */
@@ -103,7 +103,7 @@ char *proc_text(pid_t pid, const char *name, char *first, size_t first_bytes)
 			n = -1;
 			break;
 		}
-		more = realloc(text == first ? NULL : text, 4 * room);
+		more = got_memory(realloc(text == first ? NULL : text, 4 * room));
 		if (!more) {
 			n = -1;
 			break;
@@ -280,7 +280,7 @@ int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max)
 	char name[32];
 
 	snprintf(name, sizeof name, "%d/children", tid);
-	return read_children(openat(task_dirfd, name, O_RDONLY | O_CLOEXEC), children, max);
+	return read_children(got_fd(openat(task_dirfd, name, O_RDONLY | O_CLOEXEC)), children, max);
 }
 
 int proc_children(pid_t pid, pid_t *children, int max)
@@ -297,7 +297,7 @@ FILE *proc_lines(pid_t pid, const char *name, char buffer[PROC_LINES])
 	FILE *lines;
 
 	snprintf(path, sizeof path, "/proc/%d/%s", pid, name);
-	lines = fopen(path, "re");
+	lines = got_memory(fopen(path, "re"));
 	if (lines)
 		(void)setvbuf(lines, buffer, _IOFBF, PROC_LINES);
 	return lines;
@@ -459,7 +459,7 @@ pid_t proc_pidfd_pid(int pidfd)
 
 int proc_pidfd_open(pid_t pid)
 {
-	return (int)syscall(SYS_pidfd_open, pid, 0);
+	return got_fd((int)syscall(SYS_pidfd_open, pid, 0));
 }
 
 int proc_sched(pid_t tid, struct proc_sched *sched)
@@ -535,7 +535,7 @@ bool pidfd_await_end(int pidfd, uint64_t ns)
 
 int proc_borrow_fd(int pidfd, int fd)
 {
-	return (int)syscall(SYS_pidfd_getfd, pidfd, fd, 0);
+	return got_fd((int)syscall(SYS_pidfd_getfd, pidfd, fd, 0));
 }
 
 int proc_oom_score_adj(pid_t pid)

@@ -75,7 +75,7 @@ static char *read_name(const struct look *look, int fd)
 	if (n < 0)
 		return NULL;
 	name[n] = 0;
-	return budget_take((uint64_t)n) ? strdup(name) : NULL;
+	return budget_take((uint64_t)n) ? got_memory(strdup(name)) : NULL;
 }
 
 static bool learn_name(struct look *look, struct file *f)
@@ -292,7 +292,7 @@ static bool is_remote(struct look *look, int fd, const struct file *f)
 
 static bool is_on_server(struct look *look, const char *number, const struct file *f)
 {
-	int fd = openat(look->fd_dir, number, O_PATH | O_CLOEXEC);
+	int fd = got_fd(openat(look->fd_dir, number, O_PATH | O_CLOEXEC));
 	const bool is = fd >= 0 && is_remote(look, fd, f);
 
 	close_fd(&fd);

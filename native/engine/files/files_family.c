@@ -312,7 +312,7 @@ static void give_end(const struct tables *tables, const struct file *w, int end)
 			continue;
 		work->source[k] = -1;
 		close_fd(&work->local[k]);
-		work->local[k] = fcntl(end, F_DUPFD_CLOEXEC, 0);
+		work->local[k] = got_fd(fcntl(end, F_DUPFD_CLOEXEC, 0));
 	}
 	close(end);
 }
@@ -427,7 +427,9 @@ static int find_flight(const struct tables *tables, const struct file_flight *fl
 static int *find_flights(const struct tables *tables, const struct files_work *work,
 			 const struct file *content)
 {
-	int *passed = content->flight_count ? calloc(content->flight_count, sizeof *passed) : NULL;
+	int *passed = content->flight_count
+			      ? got_memory(calloc(content->flight_count, sizeof *passed))
+			      : NULL;
 
 	for (uint32_t i = 0; passed && i < content->flight_count; i++) {
 		const struct file_flight *flight = &content->flight[i];
@@ -463,7 +465,7 @@ static void put_contents(const struct tables *tables)
 			content = content_of(tables, w);
 			found = find_opposite(tables, w, &other_fd);
 			if (!found && w->kind == FILE_PIPE && has_ended(tables, w)) {
-				other_fd = fcntl(fd, F_DUPFD_CLOEXEC, 0);
+				other_fd = got_fd(fcntl(fd, F_DUPFD_CLOEXEC, 0));
 				found = true;
 			}
 			if (found && (content->content_bytes || content->content_lost ||
@@ -707,6 +709,8 @@ int files_restore(struct image *image, uint32_t images, const struct avc_config 
 		see_to_pairs(&tables, false);
 		result = tables_finish(&tables, err);
 	}
+	if (!result)
+		result = shortage_check(err, "restore descriptors");
 	if (result)
 		(void)await_gathered(&tables, &ignored);
 	tables_end(&tables);

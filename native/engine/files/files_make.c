@@ -39,18 +39,20 @@ static int open_as(int fd, const struct file *want)
 	/* O_TMPFILE is more than one bit, and has O_DIRECTORY. */
 	const int flags = want->flags &
 			  ~(O_CREAT | O_EXCL | O_TRUNC | O_NOFOLLOW | O_TMPFILE | FASYNC);
-	int opened, reader;
+	int again, reader;
 
 	if (want->flags & O_PATH)
-		return fcntl(fd, F_DUPFD_CLOEXEC, 3);
-	opened = open_again(fd, flags);
-	if (opened < 0 && errno == ENXIO && want->kind == FILE_FIFO) {
+		return got_fd(fcntl(fd, F_DUPFD_CLOEXEC, 3));
+	if (want->kind == FILE_DEVICE)
+		return open_device(fd, flags);
+	again = open_again(fd, flags);
+	if (again < 0 && errno == ENXIO && want->kind == FILE_FIFO) {
 		/* For writing, without a reader: there must be one temporarily. */
 		reader = open_again(fd, O_RDONLY);
-		opened = open_again(fd, flags);
+		again = open_again(fd, flags);
 		close_fd(&reader);
 	}
-	return opened;
+	return again;
 }
 
 int file_open_path(const struct file *want, pid_t init, const struct file_rights *rights)
@@ -112,7 +114,7 @@ int file_find(const struct file *want, pid_t template, pid_t init)
 
 static int open_empty(const struct file *want)
 {
-	return open("/dev/null", (want->flags & (O_ACCMODE | O_PATH)) | O_CLOEXEC);
+	return got_fd(open("/dev/null", (want->flags & (O_ACCMODE | O_PATH)) | O_CLOEXEC));
 }
 
 bool file_is_pts(const struct file *f)
@@ -165,11 +167,11 @@ static const char not_again[] = "it was closed since the checkpoint and cannot b
 /* In the app's network namespace, or it would get a way into ours. */
 static int socket_of(pid_t template, int domain, int type, int protocol)
 {
-	int own = open("/proc/thread-self/ns/net", O_RDONLY | O_CLOEXEC);
+	int own = got_fd(open("/proc/thread-self/ns/net", O_RDONLY | O_CLOEXEC));
 	int theirs = proc_open(template, "ns/net", O_RDONLY), fd = -1;
 
 	if (own >= 0 && theirs >= 0 && setns(theirs, CLONE_NEWNET) == 0) {
-		fd = socket(domain, type | SOCK_CLOEXEC, protocol);
+		fd = got_fd(socket(domain, type | SOCK_CLOEXEC, protocol));
 		if (setns(own, CLONE_NEWNET))
 			close_fd(&fd);
 	}
@@ -318,7 +320,7 @@ static int make_pidfd(const struct file *want, pid_t init)
 	close_fd(&fd);
 	if (!told || want->pid <= 0)
 		return -1;
-	fd = (int)syscall(SYS_pidfd_open, want->pid, want->flags & (O_NONBLOCK | O_EXCL));
+	fd = got_fd((int)syscall(SYS_pidfd_open, want->pid, want->flags & (O_NONBLOCK | O_EXCL)));
 	if (fd >= 0 && !is_the_one(fd, want))
 		close_fd(&fd);
 	return fd;
@@ -347,17 +349,18 @@ int file_make(const struct file *want, pid_t template, pid_t init, const struct 
 		fd = take_from_init(want, init);
 		return fd >= 0 ? fd : make_socket(want, template, init, rights, why);
 	case FILE_EVENTFD:
-		return eventfd(0, EFD_CLOEXEC | (nonblock ? EFD_NONBLOCK : 0) |
-					  (want->semaphore ? EFD_SEMAPHORE : 0));
+		return got_fd(eventfd(0, EFD_CLOEXEC | (nonblock ? EFD_NONBLOCK : 0) |
+						 (want->semaphore ? EFD_SEMAPHORE : 0)));
 	case FILE_TIMERFD:
-		return timerfd_create(want->clock, TFD_CLOEXEC | (nonblock ? TFD_NONBLOCK : 0));
+		return got_fd(
+			timerfd_create(want->clock, TFD_CLOEXEC | (nonblock ? TFD_NONBLOCK : 0)));
 	case FILE_SIGNALFD:
-		return (int)syscall(SYS_signalfd4, -1, &want->mask, 8,
-				    SFD_CLOEXEC | (nonblock ? SFD_NONBLOCK : 0));
+		return got_fd((int)syscall(SYS_signalfd4, -1, &want->mask, 8,
+					   SFD_CLOEXEC | (nonblock ? SFD_NONBLOCK : 0)));
 	case FILE_EPOLL:
-		return epoll_create1(EPOLL_CLOEXEC);
+		return got_fd(epoll_create1(EPOLL_CLOEXEC));
 	case FILE_INOTIFY:
-		return inotify_init1(IN_CLOEXEC | (nonblock ? IN_NONBLOCK : 0));
+		return got_limited_fd(inotify_init1(IN_CLOEXEC | (nonblock ? IN_NONBLOCK : 0)));
 	case FILE_PIDFD:
 		fd = make_pidfd(want, init);
 		if (fd < 0)

@@ -133,7 +133,7 @@ static bool is_unchanged(const struct mapped_area *a, pid_t template, struct mou
 	};
 	const size_t bytes = a->end - a->start;
 	int fd = open_data(template, &m, mounts, leases);
-	uint8_t *now = malloc(bytes);
+	uint8_t *now = got_memory(malloc(bytes));
 	bool same;
 
 	same = fd >= 0 && now && a->bytes >= 0 &&

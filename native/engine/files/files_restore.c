@@ -286,7 +286,7 @@ static int reopen_pipe(const struct files_work *work, const struct file *w)
 		return -1;
 	snprintf(path, sizeof path, "/proc/%d/fd/%d", work->table, n->fd);
 	/* With O_NONBLOCK, or it would wait for somebody at the other end. */
-	return open(path, (w->flags & O_ACCMODE) | O_NONBLOCK | O_CLOEXEC);
+	return got_fd(open(path, (w->flags & O_ACCMODE) | O_NONBLOCK | O_CLOEXEC));
 }
 
 /* IPv6 has ports of its own. */
@@ -775,7 +775,7 @@ int files_borrow_placed(const struct files_work *work, const struct file *w)
 {
 	const int local = work->local[files_leader(work->want, w)];
 
-	return local >= 0 ? fcntl(local, F_DUPFD_CLOEXEC, 0)
+	return local >= 0 ? got_fd(fcntl(local, F_DUPFD_CLOEXEC, 0))
 			  : proc_borrow_fd(work->table_pidfd, w->fd);
 }
 
@@ -937,7 +937,7 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 	cut_strange(work);
 	give_up_own(work);
 	break_pairs(work);
-	return 0;
+	return shortage_check(err, "restore descriptors");
 }
 
 void files_work_end(struct files_work *work)
@@ -989,7 +989,7 @@ static void give_to_host(struct files_work *work, uint32_t i)
 	if (h < 0 || local < 0 || host_has(work->host, h))
 		return;
 	work->host->local[files_leader(work->host->want, &work->host->want->file[h])] =
-		fcntl(local, F_DUPFD_CLOEXEC, 0);
+		got_fd(fcntl(local, F_DUPFD_CLOEXEC, 0));
 }
 
 /* All other processes get a rebuilt table.  Its holder closes what is new only when everything has
@@ -1007,14 +1007,16 @@ static int gather_anew(struct files_work *work, struct avc_error *err)
 	gather(work);
 	for (uint32_t i = 0; i < work->want->count; i++)
 		give_to_host(work, i);
-	return start_calls(work, err);
+	return shortage_check(err, "restore descriptors") ? -1 : start_calls(work, err);
 }
 
 int files_work_gather(struct files_work *work, struct avc_error *err)
 {
 	gather(work);
 	call_begin(call_of(work), INJ_AFTER_PARK);
-	if (forget_watches(work, err) || close_new(work, err))
+	/* Before what the next try would find in the table is closed. */
+	if (shortage_check(err, "restore descriptors") || forget_watches(work, err) ||
+	    close_new(work, err))
 		return -1;
 	if (work->process->descendant)
 		return gather_anew(work, err);
@@ -1028,6 +1030,8 @@ int files_work_place(struct files_work *work, struct avc_error *err)
 	if (files_give_up_sets(work, err))
 		return -1;
 	make_lost(work);
+	if (shortage_check(err, "restore descriptors"))
+		return -1;
 	if (!work->process->descendant && put_lost(work, err))
 		return -1;
 	put_states(work);

@@ -121,8 +121,8 @@ int file_rights_pair(const struct file_rights *rights, int type, int ends[2])
 	if (!is_effective_user(rights->user, rights->group))
 		errno = EPERM;
 	else
-		result = type ? socketpair(AF_UNIX, type | SOCK_CLOEXEC, 0, ends)
-			      : pipe2(ends, O_CLOEXEC);
+		result = got_fd(type ? socketpair(AF_UNIX, type | SOCK_CLOEXEC, 0, ends)
+				     : pipe2(ends, O_CLOEXEC));
 	/* The real user is still our own, and our capabilities come back with it. */
 	syscall(SYS_setresuid, -1, own.user, -1);
 	syscall(SYS_setresgid, -1, own.group, -1);

@@ -100,7 +100,7 @@ static void forget_autobound(struct file_socket *s)
 
 void file_look_at_socket(int fd, struct file *file)
 {
-	struct file_socket *s = calloc(1, sizeof *s);
+	struct file_socket *s = got_memory(calloc(1, sizeof *s));
 
 	if (!s)
 		return;
@@ -260,11 +260,11 @@ static void hear_diag(const struct nlmsghdr *head, struct file_socket *s)
 /* A socket of the network namespace of the process. */
 static int diag_open(pid_t pid)
 {
-	int own = open("/proc/thread-self/ns/net", O_RDONLY | O_CLOEXEC);
+	int own = got_fd(open("/proc/thread-self/ns/net", O_RDONLY | O_CLOEXEC));
 	int theirs = proc_open(pid, "ns/net", O_RDONLY), fd = -1;
 
 	if (own >= 0 && theirs >= 0 && setns(theirs, CLONE_NEWNET) == 0) {
-		fd = socket(AF_NETLINK, SOCK_RAW | SOCK_CLOEXEC, NETLINK_SOCK_DIAG);
+		fd = got_fd(socket(AF_NETLINK, SOCK_RAW | SOCK_CLOEXEC, NETLINK_SOCK_DIAG));
 		if (setns(own, CLONE_NEWNET))
 			close_fd(&fd);
 	}
@@ -340,7 +340,7 @@ static bool wants_peer(const struct file *f)
 
 void files_find_peers(struct files *files, pid_t pid)
 {
-	struct file **asked = calloc(files->count + 1, sizeof *asked);
+	struct file **asked = got_memory(calloc(files->count + 1, sizeof *asked));
 	uint32_t count = 0;
 	int diag;
 
@@ -384,7 +384,7 @@ static bool sort_ends(struct files *files)
 {
 	if (files->ends)
 		return true;
-	files->ends = malloc((files->count + 1) * sizeof *files->ends);
+	files->ends = got_memory(malloc((files->count + 1) * sizeof *files->ends));
 	for (uint32_t i = 0; files->ends && i < files->count; i++)
 		if (files->file[i].kind == FILE_PIPE || files->file[i].kind == FILE_SOCKET)
 			files->ends[files->end_count++] = &files->file[i];
@@ -413,7 +413,7 @@ static bool scratch_open(struct scratch *scratch, int bytes)
 	int ends[2];
 
 	if (scratch->in < 0) {
-		if (pipe2(ends, O_CLOEXEC | O_NONBLOCK))
+		if (got_fd(pipe2(ends, O_CLOEXEC | O_NONBLOCK)))
 			return false;
 		scratch->in = ends[0];
 		scratch->out = ends[1];

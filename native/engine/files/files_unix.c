@@ -232,7 +232,7 @@ static int call_there(struct errand *errand, pid_t template, pid_t init)
 	errand->folder[0] = proc_open(template, "cwd", O_PATH | O_DIRECTORY);
 	errand->root[1] = proc_open(init, "root", O_PATH | O_DIRECTORY);
 	errand->folder[1] = relative ? open_old_folder(errand, errand->root[1])
-				     : fcntl(errand->root[1], F_DUPFD_CLOEXEC, 0);
+				     : got_fd(fcntl(errand->root[1], F_DUPFD_CLOEXEC, 0));
 	failed = pthread_create(&thread, NULL, errand_main, errand);
 	if (failed)
 		errand->errnum = failed;
@@ -259,7 +259,7 @@ static bool is_dead(int file)
 
 	if (fstat(file, &st) || !S_ISSOCK(st.st_mode))
 		return false;
-	fd = socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC, 0);
+	fd = got_fd(socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC, 0));
 	strcpy(address.sun_path, fd_path(file).text);
 	dead = fd >= 0 && connect(fd, (const struct sockaddr *)&address, sizeof address) &&
 	       errno == ECONNREFUSED;
@@ -269,7 +269,7 @@ static bool is_dead(int file)
 
 static bool make_way(int folder, const char *name)
 {
-	int file = openat(folder, name, O_PATH | O_NOFOLLOW | O_CLOEXEC);
+	int file = got_fd(openat(folder, name, O_PATH | O_NOFOLLOW | O_CLOEXEC));
 	bool dead;
 
 	if (file < 0)

@@ -75,14 +75,13 @@ static void try_mount(struct file_system *fs, pid_t init, char *line)
 
 static void open_file_system(struct file_system *fs, pid_t init, uint64_t dev)
 {
-	char path[48], *line = NULL;
+	char buffer[PROC_LINES], *line = NULL;
 	size_t size = 0;
 	FILE *mounts;
 
 	close_fd(&fs->anchor);
 	fs->dev = dev;
-	snprintf(path, sizeof path, "/proc/%d/mountinfo", init);
-	mounts = fopen(path, "re");
+	mounts = proc_lines(init, "mountinfo", buffer);
 	while (mounts && fs->anchor < 0 && getline(&line, &size, mounts) > 0)
 		try_mount(fs, init, line);
 	free(line);
@@ -102,7 +101,7 @@ static int open_handle(int anchor, int type, const uint8_t *bytes, uint32_t coun
 		return -1;
 	}
 	memcpy(handle.head.f_handle, bytes, count);
-	return open_by_handle_at(anchor, &handle.head, O_PATH | O_CLOEXEC);
+	return got_fd(open_by_handle_at(anchor, &handle.head, O_PATH | O_CLOEXEC));
 }
 
 /* fs/overlayfs/overlayfs.h: struct ovl_fh, behind three bytes of padding. */

@@ -352,6 +352,7 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 			break;
 		}
 		budget_begin(say_working, guard);
+		shortage_begin();
 		if (together && guard->dead.ended.count)
 			fail(&restore.notes, AVC_UNSUPPORTED, 0, guard->main.inside,
 			     "restore descriptors", "", "%u of its connections have ended: %s",
@@ -360,6 +361,9 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 		/* Written since the newest means written since all others, also where that cannot
 		 * be seen any more. */
 		if (guard_check_files(guard, generation, image->template, image->pidfd, &failed)) {
+			if (shortage_check(&failed, "restore") && !together &&
+			    await_room(report, &failed))
+				continue;
 			*error = failed;
 			guard_drop_all(guard);
 			break;

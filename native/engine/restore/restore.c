@@ -203,7 +203,9 @@ static bool has_number(const struct proc_status *status, pid_t number)
 int restore_fail_taken(pid_t init, pid_t number, struct avc_error *err)
 {
 	char inside[64] = "", its[64];
-	DIR *proc = proc_link(init, "ns/pid", inside, sizeof inside) < 0 ? NULL : opendir("/proc");
+	DIR *proc = proc_link(init, "ns/pid", inside, sizeof inside) < 0
+			    ? NULL
+			    : got_memory(opendir("/proc"));
 	struct proc_status status;
 	struct proc_stat stat;
 	struct dirent *entry;
@@ -586,11 +588,13 @@ int restore_app(struct restore *restore, struct avc_error *err)
 		fd_table_free(&generation->image[i].table);
 	if (!result) {
 		restore_note(main, restore->pid, &restore->notes);
-		result = memory_put_back(main, restore->pid, &restore->notes, err) ||
-					 restore->ready(restore->arg, err)
-				 ? -1
-				 : 0;
+		result = memory_put_back(main, restore->pid, &restore->notes, err);
 	}
+	/* Something has been left out, or taken for gone. */
+	if (shortage_check(err, "restore"))
+		result = -1;
+	if (!result)
+		result = restore->ready(restore->arg, err);
 	if (!result)
 		restore_patience_end(); /* it has its verdict, and is not to wait for anybody */
 	if (result)

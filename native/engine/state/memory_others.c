@@ -182,7 +182,7 @@ static void look(struct mem_others *others, const struct process *process)
 {
 	const bool whole = proc_inside(process->init) == 1;
 	char inside[64] = "", its[64];
-	DIR *proc = opendir("/proc");
+	DIR *proc = got_memory(opendir("/proc"));
 	struct dirent *entry;
 
 	others->looked_ns = now_ns();

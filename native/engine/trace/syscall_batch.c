@@ -341,7 +341,8 @@ void syscall_batch_pass_socket(const struct fd_channel *fd_channel, const struct
 	int ends[2];
 
 	*passed = (struct fd_channel){ -1, -1 };
-	if (fd_channel->ours < 0 || socketpair(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, ends))
+	if (fd_channel->ours < 0 ||
+	    got_fd(socketpair(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, ends)))
 		return;
 	if (fd_send(fd_channel->ours, ends[1]) == 0) {
 		const avc_remote remote = parasite_remote(parasite, letter);
