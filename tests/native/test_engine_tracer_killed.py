@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -114,28 +115,35 @@ def test_handlers_run_on_their_own_stack(tmp_path: Path) -> None:
             guard.start_another(victim.pid)
 
 
+@contextlib.contextmanager
+def locked(victim: Victim) -> Iterator[None]:
+    """As by another guard."""
+    path = victim.ctl_path()
+    assert path is not None
+    held = os.open(path, os.O_RDWR)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(held)
+
+
 def test_a_lock_that_is_still_held_is_waited_for(tmp_path: Path) -> None:
     """A helper of a guard that was killed shares its lock, until it gets a CPU to end."""
-    with Victim("idle 1 1", tmp_path) as victim:
-        path = victim.ctl_path()
-        assert path is not None
-        held = os.open(path, os.O_RDWR)
-        fcntl.flock(held, fcntl.LOCK_EX)
+    with Victim("idle 1 1", tmp_path) as victim, contextlib.ExitStack() as lock:
+        lock.enter_context(locked(victim))
         with GuardProcess(config(0.05), [victim.pid]) as guard:
             guard.wait("started")
             time.sleep(0.1)
-            os.close(held)
+            lock.close()
             guard.wait("checkpoint")
             assert "unprotected" not in [event["kind"] for event in guard.events]
 
 
 def test_another_guard_is_told_of(tmp_path: Path) -> None:
-    with Victim("idle 1 1", tmp_path) as victim:
-        path = victim.ctl_path()
-        assert path is not None
-        held = os.open(path, os.O_RDWR)
-        fcntl.flock(held, fcntl.LOCK_EX)
+    with Victim("idle 1 1", tmp_path) as victim, contextlib.ExitStack() as lock:
+        lock.enter_context(locked(victim))
         with GuardProcess(config(0.05), [victim.pid]) as guard:
             guard.wait_for(lambda event: "another avckpt guards it" in str(event.get("error")), "it is told")
-            os.close(held)
+            lock.close()
             guard.wait("checkpoint")
