@@ -73,37 +73,29 @@ static pid_t session_of_other(const struct tree_entry *entry, const struct proc_
 }
 
 /* Now, while all are stopped: right after, it may be in another group, or the group's leader may be
- * gone.  A leader that cannot be seen for want of descriptors is none that is gone. */
-static int keep_place(const struct tree *tree, const struct tree_entry *entry,
-		      const struct image *main, struct image *image, struct avc_error *err)
+ * gone. */
+static void keep_place(const struct tree *tree, const struct tree_entry *entry,
+		       const struct image *main, struct image *image)
 {
 	const struct proc_stat *stat = &entry->stat, *of_main = &tree->entry[0].stat;
-	const bool other_session = stat->session != of_main->session;
 	struct proc_status status = { 0 };
-	pid_t session, group = 0;
+	pid_t session = number_inside(tree, stat->session), group;
 
-	errno = 0;
 	image->pid = entry->pid;
-	image->stat = *stat;
-	image->exit_signal = stat->exit_signal;
 	image->inside = entry->ended ? proc_inside(entry->pid) : entry->process->inside;
-	session = number_inside(tree, stat->session);
-	if (!is_shortage(errno))
-		group = number_inside(tree, stat->group);
+	image->stat = *stat;
+	group = number_inside(tree, stat->group);
 	if (!group && image != main && stat->group == of_main->group)
 		group = main->group;
 	/* The kernel knows the numbers inside, whichever process had them. */
-	if (!is_shortage(errno) && (!group || (!session && other_session)))
+	if (!group || (!session && stat->session != of_main->session))
 		(void)proc_status(entry->pid, &status);
-	if (!is_shortage(errno) && !session && other_session)
+	if (!session && stat->session != of_main->session)
 		session = session_of_other(entry, &status, image);
 	image->session = session;
 	image->group = group ? group : status.group;
-	if (!is_shortage(errno) && stat->tty)
-		image->tty_group = group_inside(tree, stat->tty_group);
-	return is_shortage(errno)
-		       ? fail_errno(err, entry->pid, "freeze", "open(status)", "it cannot be seen")
-		       : 0;
+	image->tty_group = stat->tty ? group_inside(tree, stat->tty_group) : 0;
+	image->exit_signal = stat->exit_signal;
 }
 
 /* The processes found become the images, in the same order. */
@@ -118,8 +110,8 @@ static int make_images(const struct tree *tree, struct generation *generation,
 				  "it has ended");
 	if (generation_make_room(generation, tree->count, err))
 		return -1;
-	if (keep_place(tree, &tree->entry[0], &generation->image[0], &generation->image[0], err))
-		return -1;
+	shortage_begin();
+	keep_place(tree, &tree->entry[0], &generation->image[0], &generation->image[0]);
 	index[0] = 0;
 	for (uint32_t i = 1; i < tree->count; i++) {
 		const struct tree_entry *entry = &tree->entry[i];
@@ -136,8 +128,7 @@ static int make_images(const struct tree *tree, struct generation *generation,
 			.pidfd = -1,
 			.slot = slot,
 		};
-		if (keep_place(tree, entry, &generation->image[0], image, err))
-			return -1;
+		keep_place(tree, entry, &generation->image[0], image);
 		if (entry->ended) {
 			if (image->parent == PARENT_INIT || image->inside <= 0)
 				continue; /* init is just about to wait for it */
@@ -148,7 +139,8 @@ static int make_images(const struct tree *tree, struct generation *generation,
 		}
 		generation->images++;
 	}
-	return 0;
+	/* A leader that could not be seen is none that is gone. */
+	return shortage_check(err, "freeze");
 }
 
 static int find_others(struct tree *tree, struct generation *generation, struct avc_error *err)

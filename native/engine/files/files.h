@@ -657,6 +657,8 @@ int file_open_path(const struct file *want, pid_t init, const struct file_rights
 /* The file that it was, by its path or because it is still mapped: an O_PATH descriptor; or -1, with
  * errno: ESTALE if another one has its name. */
 int file_find(const struct file *want, pid_t template, pid_t init);
+/* A new socket in the network namespace of that process: another one would give it a way into ours. */
+int file_socket_of(pid_t pid, int domain, int type, int protocol);
 /* A descriptor of ours for what is not in the table any more, or -1 with *why.  *why may be set on
  * success as well: what differs. */
 int file_make(const struct file *want, pid_t template, pid_t init, const struct file_rights *rights,

@@ -164,11 +164,10 @@ static int make_named(const struct file *want, pid_t template, pid_t init,
 
 static const char not_again[] = "it was closed since the checkpoint and cannot be made again";
 
-/* In the app's network namespace, or it would get a way into ours. */
-static int socket_of(pid_t template, int domain, int type, int protocol)
+int file_socket_of(pid_t pid, int domain, int type, int protocol)
 {
 	int own = got_fd(open("/proc/thread-self/ns/net", O_RDONLY | O_CLOEXEC));
-	int theirs = proc_open(template, "ns/net", O_RDONLY), fd = -1;
+	int theirs = proc_open(pid, "ns/net", O_RDONLY), fd = -1;
 
 	if (own >= 0 && theirs >= 0 && setns(theirs, CLONE_NEWNET) == 0) {
 		fd = got_fd(socket(domain, type | SOCK_CLOEXEC, protocol));
@@ -214,7 +213,7 @@ static int make_dead(const struct file *want, pid_t template, const struct file_
 		return ends[mine];
 	}
 	if (s && s->protocol == IPPROTO_TCP) {
-		fd = socket_of(template, s->domain, SOCK_STREAM, IPPROTO_TCP);
+		fd = file_socket_of(template, s->domain, SOCK_STREAM, IPPROTO_TCP);
 		if (fd >= 0) {
 			if (file_tcp_is_cut(want))
 				(void)file_break_tcp(fd, s->domain);
@@ -276,7 +275,7 @@ static int make_socket(const struct file *want, pid_t template, pid_t init,
 			*why = not_again;
 		return make_dead(want, template, rights);
 	}
-	fd = socket_of(template, s->domain, s->type, s->protocol);
+	fd = file_socket_of(template, s->domain, s->type, s->protocol);
 	if (fd < 0)
 		return make_dead(want, template, rights);
 	/* Only sockets of one user can share a port (socket(7), SO_REUSEPORT). */

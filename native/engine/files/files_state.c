@@ -257,22 +257,6 @@ static void hear_diag(const struct nlmsghdr *head, struct file_socket *s)
 	}
 }
 
-/* A socket of the network namespace of the process. */
-static int diag_open(pid_t pid)
-{
-	int own = got_fd(open("/proc/thread-self/ns/net", O_RDONLY | O_CLOEXEC));
-	int theirs = proc_open(pid, "ns/net", O_RDONLY), fd = -1;
-
-	if (own >= 0 && theirs >= 0 && setns(theirs, CLONE_NEWNET) == 0) {
-		fd = got_fd(socket(AF_NETLINK, SOCK_RAW | SOCK_CLOEXEC, NETLINK_SOCK_DIAG));
-		if (setns(own, CLONE_NEWNET))
-			close_fd(&fd);
-	}
-	close_fd(&own);
-	close_fd(&theirs);
-	return fd;
-}
-
 /* Comes from socketpair(2), or from connect(2) and accept(2).  A datagram socket with a name, or
  * connected by one, may have many others. */
 static bool maybe_pair(const struct file *f)
@@ -347,7 +331,7 @@ void files_find_peers(struct files *files, pid_t pid)
 	for (uint32_t i = 0; asked && i < files->count; i++)
 		if (wants_peer(&files->file[i]))
 			asked[count++] = &files->file[i];
-	diag = count ? diag_open(pid) : -1;
+	diag = count ? file_socket_of(pid, AF_NETLINK, SOCK_RAW, NETLINK_SOCK_DIAG) : -1;
 	if (diag >= 0) {
 		qsort(asked, count, sizeof(void *), by_inode);
 		if (count > ASKED_EACH && ask_diag(diag, 0))

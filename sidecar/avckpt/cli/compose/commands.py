@@ -156,7 +156,7 @@ def down(
     compose = Compose(paths, project, profiles=profiles, env_file=env_file)
     before = compose.containers() if as_json else []
     complaint = compose.down(services, volumes, _say)
-    staying = compose.containers()
+    staying = compose.containers() if as_json or not services or complaint else []
     if staying and complaint:
         meant = services or compose.services()
         names = ", ".join(sorted(one.name for one in staying if one.service in meant))
