@@ -46,7 +46,7 @@ struct avc_event guard_event(const struct avc_guard *guard, enum avc_event_kind 
 
 /* A daemon that does not read must not block the guard: events that the socket has no room for
  * wait here, and when this is full, the oldest are lost. */
-static void send_outbox(struct avc_guard *guard)
+void guard_send_posted(struct avc_guard *guard)
 {
 	uint32_t sent = 0;
 
@@ -59,14 +59,27 @@ static void send_outbox(struct avc_guard *guard)
 	memmove(guard->outbox, guard->outbox + sent, guard->outbox_count * sizeof *guard->outbox);
 }
 
-void guard_emit(struct avc_guard *guard, const struct avc_event *event)
+static void post(struct avc_guard *guard, const struct avc_event *event)
 {
-	guard_tell_untold(guard); /* in order */
 	if (guard->outbox_count == OUTBOX_MAX)
 		memmove(guard->outbox, guard->outbox + 1,
 			--guard->outbox_count * sizeof *guard->outbox);
 	guard->outbox[guard->outbox_count++] = *event;
-	send_outbox(guard);
+}
+
+void guard_post(struct avc_guard *guard, const struct avc_event *event)
+{
+	struct avc_event before;
+
+	if (guard_take_untold(guard, &before)) /* in order */
+		post(guard, &before);
+	post(guard, event);
+}
+
+void guard_emit(struct avc_guard *guard, const struct avc_event *event)
+{
+	guard_post(guard, event);
+	guard_send_posted(guard);
 }
 
 void guard_emit_error(struct avc_guard *guard, enum avc_event_kind kind, uint64_t ticket,
@@ -293,7 +306,7 @@ void guard_await_seen(struct avc_guard *guard)
 	guard->unseen = 0;
 	if (!pid)
 		return;
-	send_outbox(guard);
+	guard_send_posted(guard);
 	for (uint64_t now; (now = now_ns()) < end;) {
 		const struct timespec left = timespec_of(end - now);
 		struct pollfd socket = { .fd = guard->socket, .events = POLLIN };
@@ -317,7 +330,7 @@ static void carry_out(struct avc_guard *guard)
 	struct avc_request request;
 	int found, fd;
 
-	send_outbox(guard);
+	guard_send_posted(guard);
 	while ((found = next_request(guard, &request, &fd)) > 0) {
 		carry_out_one(guard, &request, fd);
 		close_fd(&fd);
@@ -704,10 +717,10 @@ static void send_last_words(struct avc_guard *guard)
 {
 	struct pollfd daemon = { .fd = guard->socket, .events = POLLOUT };
 
-	send_outbox(guard);
+	guard_send_posted(guard);
 	while (guard->outbox_count && poll_for(&daemon, 1, LAST_WORDS_NS) == 1 &&
 	       !(daemon.revents & (POLLERR | POLLHUP)))
-		send_outbox(guard);
+		guard_send_posted(guard);
 }
 
 int guard_run(int socket)

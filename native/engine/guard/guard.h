@@ -151,6 +151,9 @@ struct avc_guard {
 
 struct avc_event guard_event(const struct avc_guard *guard, enum avc_event_kind kind);
 void guard_emit(struct avc_guard *guard, const struct avc_event *event);
+/* Without waking the daemon now: it is sent with the next one, or by guard_send_posted(). */
+void guard_post(struct avc_guard *guard, const struct avc_event *event);
+void guard_send_posted(struct avc_guard *guard);
 void guard_emit_error(struct avc_guard *guard, enum avc_event_kind kind, uint64_t ticket,
 		      const struct avc_error *error);
 void guard_refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, const char *why);
@@ -264,6 +267,8 @@ bool guard_pace_dozes(struct avc_guard *guard);
 /* Reports a checkpoint, now or soon; reports those not reported yet; when that is due. */
 void guard_tell_taken(struct avc_guard *guard, struct avc_event *event);
 void guard_tell_untold(struct avc_guard *guard);
+/* They are reported otherwise.  False: there are none. */
+bool guard_take_untold(struct avc_guard *guard, struct avc_event *event);
 uint64_t guard_tell_due(const struct avc_guard *guard);
 
 /* ---- thread_events.c ------------------------------------------------------- */

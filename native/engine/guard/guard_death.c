@@ -157,6 +157,7 @@ static void say_working(void *arg)
 	if (now - guard->init_seen_ns < INIT_LOOK_NS)
 		return;
 	guard->init_seen_ns = now;
+	guard_send_posted(guard);
 	if (proc_is_killed(guard->channel.init))
 		restore_is_in_vain();
 }
@@ -513,7 +514,8 @@ static void begin_death(struct avc_guard *guard, const struct avc_report *report
 	if (guard->config.remains_ns && guard->count)
 		event.likeness_pid = guard->generations[guard->count - 1].image[0].template;
 	guard->unseen = event.remains_pid ? event.remains_pid : event.likeness_pid;
-	guard_emit(guard, &event);
+	/* The daemon, once woken, could take the CPU that the app is about to be restored on. */
+	guard_post(guard, &event);
 	process_close(&guard->main);
 	guard_kill_lost(guard);
 }

@@ -251,15 +251,22 @@ void guard_tell_taken(struct avc_guard *guard, struct avc_event *event)
 		guard_tell_untold(guard);
 }
 
-void guard_tell_untold(struct avc_guard *guard)
+bool guard_take_untold(struct avc_guard *guard, struct avc_event *event)
 {
-	const struct avc_event event = guard->untold;
-
-	if (!event.checkpoints)
-		return;
+	if (!guard->untold.checkpoints)
+		return false;
+	*event = guard->untold;
 	guard->untold = (struct avc_event){ 0 };
 	guard->told_ns = now_ns();
-	guard_emit(guard, &event);
+	return true;
+}
+
+void guard_tell_untold(struct avc_guard *guard)
+{
+	struct avc_event event;
+
+	if (guard_take_untold(guard, &event))
+		guard_emit(guard, &event);
 }
 
 uint64_t guard_tell_due(const struct avc_guard *guard)
