@@ -45,10 +45,12 @@
 #define SIGKILL_ 9
 #define SIGCHLD_ 17
 #define USER_BASE 0x70000000 /* plus its PID: a user of its own */
-/* Requests come in quick succession, microseconds apart: spin on the word for a while before
- * sleeping on it. Only for a while: on a busy machine the other side could not run. */
+/* A process that makes threads asks in quick succession, microseconds apart: spin on the word for a
+ * while before sleeping on it. */
 #define SPINS 4000
+#define SPINS_UNKNOWN 400
 #define SLICE_NS 20000000
+#define STAY_SLICES 50
 /* To see that the number was used takes a system call each time. */
 #define LOOKS 50
 #define LOOK_NS 50000
@@ -268,6 +270,17 @@ static void sleep_on(uint32_t *word, uint32_t value, int64_t ns)
 	raw_syscall(__NR_futex, (uint64_t)word, FUTEX_WAIT, value, (uint64_t)slice, 0, 0);
 }
 
+/* While it spins, nobody else runs on its CPU: not if that is the one of who has asked, and has to go
+ * on first. */
+static uint32_t spins_after(const struct inj_slot *slot, int32_t once)
+{
+	if (slot->last_pid == INJ_LAST_PID_FREE || (slot->cpu && slot->cpu == current_cpu()))
+		return 0;
+	if (once)
+		return LOOKS;
+	return slot->cpu ? SPINS : SPINS_UNKNOWN;
+}
+
 static void serve(void)
 {
 	int32_t before = 0, once = 0;
@@ -295,7 +308,7 @@ static void serve(void)
 			__atomic_store_n(&slot->have, want, __ATOMIC_RELEASE);
 			SYS(__NR_futex, &slot->have, FUTEX_WAKE, INT32_MAX);
 			spins = 0;
-		} else if (++spins < (once ? LOOKS : SPINS)) {
+		} else if (++spins < spins_after(slot, once)) {
 			cpu_relax();
 		} else {
 			sleep_on(&slot->want, want, once ? LOOK_NS : SLICE_NS);
@@ -307,6 +320,8 @@ static void serve(void)
 		write_last_pid(before);
 	__atomic_store_n(&page->stopped, 1, __ATOMIC_RELEASE);
 	SYS(__NR_futex, &page->stopped, FUTEX_WAKE, INT32_MAX);
+	for (int i = 0; i < STAY_SLICES && page->stop == LASTPID_STOP; i++)
+		sleep_on(&page->stop, LASTPID_STOP, SLICE_NS);
 }
 
 /* ---- both ------------------------------------------------------------------------------------ */

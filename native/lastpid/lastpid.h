@@ -28,11 +28,15 @@ struct lastpid_message {
 	uint64_t offset[LASTPID_MESSAGE_SLOTS]; /* of the struct inj_slot, a page's   */
 };
 
+/* Its end takes time on a CPU, which the app, about to run, may need: it stays until it may go, a second
+ * at most. */
+enum lastpid_stop { LASTPID_SERVE, LASTPID_STOP, LASTPID_GO };
+
 /* Shared by the two, and accessible to a container that has CAP_SYS_PTRACE: false contents can do
  * no more harm than a failed restore. */
 struct lastpid_page {
 	uint32_t serving; /* index of the slot whose requests are served           */
-	uint32_t stop;
+	uint32_t stop;    /* futex, enum lastpid_stop                              */
 	int32_t error;    /* errno of the last request, 0: done                    */
 	uint32_t stopped; /* no more writes */
 };

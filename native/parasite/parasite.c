@@ -226,6 +226,7 @@ static uint32_t request_last_pid(struct inj_slot *slot, int32_t value, uint32_t 
 
 	slot->last_pid = value;
 	slot->once = once;
+	slot->cpu = current_cpu();
 	want = __atomic_add_fetch(&slot->want, 1, __ATOMIC_ACQ_REL);
 	futex_wake(&slot->want);
 	return want;

@@ -220,6 +220,7 @@ struct inj_slot {
 	uint32_t have;     /* set to `want` by the helper                    */
 	int32_t last_pid;  /* the value R wants, or INJ_LAST_PID_FREE        */
 	uint32_t once;     /* the number is for one clone, and then as FREE  */
+	uint32_t cpu;      /* of R, current_cpu(), when it asked             */
 	int32_t error;     /* errno                                          */
 	uint32_t error_at; /* enum inj_step                                  */
 	int32_t error_tid;

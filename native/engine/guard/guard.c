@@ -469,8 +469,6 @@ static bool wait_for_news(struct avc_guard *guard, bool straggling)
 		guard->fds[0].events |= POLLOUT;
 	watch(guard, &n, guard->channel.init_pidfd);
 	watch(guard, &n, guard->channel.report_fd);
-	if (guard->foreseen != guard->main.pid)
-		watch(guard, &n, guard->main.pidfd);
 	watch(guard, &n, output_fd(&guard->output));
 	for (uint32_t i = 0; i < guard->remains_count; i++)
 		watch(guard, &n, guard->remains[i].pidfd);
@@ -481,7 +479,8 @@ static bool wait_for_news(struct avc_guard *guard, bool straggling)
 		if (process->descendant)
 			watch(guard, &n, process->pidfd);
 		watch(guard, &n, process->holder_pidfd);
-		watch(guard, &n, process->exec_sign.fd);
+		if (!process->exec_sign.over)
+			watch(guard, &n, process->exec_sign.fd);
 	}
 	for (uint32_t i = 0; i < guard->count; i++) {
 		if (guard->generations[i].spare.pid)
@@ -570,8 +569,6 @@ static void let_go(struct avc_guard *guard)
 /* Whoever has ended, and what the daemon asks for.  True: init has ended. */
 static bool hear(struct avc_guard *guard, bool news)
 {
-	if (news && guard->foreseen != guard->main.pid && pidfd_ended(guard->main.pidfd))
-		guard_app_dies(guard);
 	if (news || now_ns() >= tracee_ending_due())
 		guard_reap_dead(guard);
 	else

@@ -90,7 +90,6 @@ struct avc_guard {
 	struct init_channel channel;
 	struct last_pid *helper; /* of the restore that is about to begin           */
 	uint64_t helper_for;     /* number of its generation                        */
-	pid_t foreseen;          /* main process that has ended, not yet reported   */
 	bool attached, unprotected;
 	bool filter_decided; /* whether it has a seccomp filter of its own      */
 	struct process main; /* the app's main process                         */
@@ -326,8 +325,6 @@ void guard_filter(struct avc_guard *guard);
 
 /* ---- guard_death.c --------------------------------------------------------- */
 
-/* The main process has ended; init has not reported how yet, so that it may not be restored. */
-void guard_app_dies(struct avc_guard *guard);
 void guard_app_died(struct avc_guard *guard, const struct avc_report *report);
 /* The memory of a dead app is not read any more. */
 void guard_release_remains(struct avc_guard *guard, pid_t pid);

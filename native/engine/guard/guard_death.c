@@ -488,14 +488,6 @@ static void kill_descendants(const struct avc_guard *guard)
 	}
 }
 
-void guard_app_dies(struct avc_guard *guard)
-{
-	guard->foreseen = guard->main.pid;
-	rt_priority_begin();
-	ready_helper(guard);
-	rt_priority_end();
-}
-
 /* Tells it, and keeps what was asked for of the dead process. */
 static void begin_death(struct avc_guard *guard, const struct avc_report *report,
 			enum avc_reason reason)
@@ -525,7 +517,6 @@ static void end_death(struct avc_guard *guard)
 	restore_patience_end();
 	if (!guard->dead.waits)
 		drop_helper(guard); /* if there was nothing to restore, after all */
-	guard->foreseen = 0;
 	rt_priority_end();
 	guard_end_recall(guard);
 	guard_leave_meeting(guard);
@@ -606,6 +597,8 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 	struct avc_error none = { 0 };
 
 	rt_priority_begin();
+	if (verdict.restore)
+		ready_helper(guard); /* meanwhile it enters the container */
 	begin_death(guard, report, verdict.reason);
 	if (!verdict.restore)
 		guard_give_up(guard, report, verdict.reason, &none);

@@ -247,6 +247,11 @@ static bool found_executed(struct process *process, uint64_t now)
 		pause = EXEC_CHECK_NS;
 	if (pause > EXEC_CHECK_LONG_NS)
 		pause = EXEC_CHECK_LONG_NS;
+	/* Its end was reported, and is dealt with elsewhere. */
+	if (process->exec_sign.over && pidfd_ended(process->pidfd)) {
+		process->exec_check_ns = UINT64_MAX;
+		return false;
+	}
 	/* First, so that no exec between the two is missed. */
 	process->exec_check_ns = process_listen_for_exec(process) ? UINT64_MAX : now + pause;
 	return process_has_executed(process);
@@ -331,7 +336,7 @@ void guard_hear_exec(struct avc_guard *guard, int fd)
 
 		if (process->exec_sign.fd != fd)
 			continue;
-		process_listen_no_more(process); /* it reports only one */
+		process->exec_sign.over = true; /* it reports only one */
 		process->exec_check_ns = 0;
 		if (!process->descendant)
 			guard->next_ns = policy_executed(&guard->policy, &guard->config,

@@ -28,6 +28,13 @@ bool process_has_executed(const struct process *process)
 	return n == sizeof nonce ? nonce != process->nonce : errno == EFAULT;
 }
 
+void process_listen_no_more(struct process *process)
+{
+	if (process->exec_sign.fd >= 0)
+		munmap(process->exec_sign.page, ARCH_PAGE_BYTES);
+	close_fd(&process->exec_sign.fd);
+}
+
 bool process_listen_for_exec(struct process *process)
 {
 	struct perf_event_attr nothing = {
@@ -39,22 +46,17 @@ bool process_listen_for_exec(struct process *process)
 	};
 	struct exec_sign *sign = &process->exec_sign;
 
-	if (sign->fd >= 0)
+	if (sign->fd >= 0 && !sign->over)
 		return true;
+	process_listen_no_more(process);
 	sign->fd = (int)syscall(SYS_perf_event_open, &nothing, process->leader, -1, -1,
 				PERF_FLAG_FD_CLOEXEC);
 	if (sign->fd < 0)
 		return false;
 	sign->page = mmap(NULL, ARCH_PAGE_BYTES, PROT_READ, MAP_SHARED, sign->fd, 0);
+	sign->over = false;
 	if (sign->page != MAP_FAILED)
 		return true;
 	close_fd(&sign->fd);
 	return false;
-}
-
-void process_listen_no_more(struct process *process)
-{
-	if (process->exec_sign.fd >= 0)
-		munmap(process->exec_sign.page, ARCH_PAGE_BYTES);
-	close_fd(&process->exec_sign.fd);
 }

@@ -48,6 +48,7 @@ bool process_make_room(struct process *process)
 
 void process_free_room(struct process *process)
 {
+	process_listen_no_more(process);
 	threads_free(process);
 	memory_free(process->memory);
 	filters_forget(process);
@@ -166,7 +167,7 @@ void process_close(struct process *process)
 	close_fd(&process->stat_fd);
 	close_fd(&process->statm_fd);
 	close_fd(&process->status_fd);
-	process_listen_no_more(process);
+	process->exec_sign.over = true; /* a restore must not wait for it, either */
 	process->pid = 0;
 	process->leader = 0;
 	process->infected = false;

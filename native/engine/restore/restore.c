@@ -590,6 +590,7 @@ int restore_app(struct restore *restore, struct avc_error *err)
 		restore_note(main, restore->pid, &restore->notes);
 		result = memory_put_back(main, restore->pid, &restore->notes, err);
 	}
+	last_pid_await_stop(restore->helper);
 	/* Something has been left out, or taken for gone. */
 	if (shortage_check(err, "restore"))
 		result = -1;

@@ -408,7 +408,7 @@ static uint32_t request(struct inj_slot *slot, pid_t value)
 	uint32_t want;
 
 	slot->last_pid = value;
-	slot->once = 0;
+	slot->once = slot->cpu = 0;
 	want = __atomic_add_fetch(&slot->want, 1, __ATOMIC_ACQ_REL);
 	wake(&slot->want);
 	return want;
@@ -451,7 +451,6 @@ const struct inj_syscall *last_pid_ask(const struct last_pid *helper,
 				       const struct parasite *parasite, struct inj_call *call,
 				       pid_t value)
 {
-	rouse(served(helper)); /* by then it is awake, and answers at once */
 	return call_add(call, INJ_LAST_PID, parasite_remote(parasite, served(helper)),
 			(uint64_t)value);
 }
@@ -474,13 +473,18 @@ void last_pid_serve(struct last_pid *helper, struct inj_slot *slot)
 	for (uint32_t i = 0; i < helper->count; i++)
 		if (helper->slot[i] == slot)
 			__atomic_store_n(&helper->page->serving, i, __ATOMIC_RELEASE);
-	rouse(before);
+	if (before != slot)
+		rouse(before);
 }
 
 void last_pid_stop(struct last_pid *helper)
 {
-	__atomic_store_n(&helper->page->stop, 1, __ATOMIC_RELEASE);
+	__atomic_store_n(&helper->page->stop, LASTPID_STOP, __ATOMIC_RELEASE);
 	rouse(served(helper));
+}
+
+void last_pid_await_stop(struct last_pid *helper)
+{
 	(void)await_word(helper, &helper->page->stopped, 1, now_ns() + STOP_NS);
 }
 
@@ -488,5 +492,9 @@ void last_pid_end(struct last_pid *helper)
 {
 	if (!helper)
 		return;
+	if (helper->page->stop) {
+		__atomic_store_n(&helper->page->stop, LASTPID_GO, __ATOMIC_RELEASE);
+		wake(&helper->page->stop);
+	}
 	helper_end(helper);
 }

@@ -284,6 +284,7 @@ struct process {
 	struct exec_sign {
 		int fd;
 		void *page;
+		bool over; /* it reports nothing any more: to be closed, which takes some 70 us */
 	} exec_sign;
 	uint64_t held_ns, exec_check_ns; /* since when it has a holder; next check for that */
 };
@@ -758,8 +759,10 @@ int last_pid_answered(const struct last_pid *helper, const struct inj_syscall *a
 void last_pid_free(struct last_pid *helper);
 /* From now on serves requests of another slot. */
 void last_pid_serve(struct last_pid *helper, struct inj_slot *slot);
-/* Nothing is written any more: the namespace's PIDs continue from where they were. */
+/* Nothing is to be written any more: the namespace's PIDs continue from where they were.  That has come
+ * true after last_pid_await_stop(), while its processes stay. */
 void last_pid_stop(struct last_pid *helper);
+void last_pid_await_stop(struct last_pid *helper);
 /* Stops it, and waits until its processes are gone; NULL: nothing to do. */
 void last_pid_end(struct last_pid *helper);
 
