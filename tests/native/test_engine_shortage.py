@@ -109,7 +109,7 @@ def test_a_death_while_there_are_no_descriptors(limit: int, where: str, tmp_path
         taken = guard.checkpoint()
         with limited(guard, resource.RLIMIT_NOFILE, limit):
             victim.kill_app()
-            time.sleep(MOMENT_S)
+            guard.wait("died")  # told while it tries
         event = guard.wait_for(lambda event: event.get("kind") in ENDS, "end of the restore")
         assert event["kind"] == "restored", event
         assert event["generation"] == taken["generation"]

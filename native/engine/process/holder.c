@@ -152,17 +152,15 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 }
 
 /* What cannot be found out is 0.  umask -1: not known yet. */
-static struct folders folders_of(const struct process *process, int32_t umask)
+static struct folders folders_of(struct process *process, int32_t umask)
 {
 	static const char *const name[] = { "root", "cwd" };
 	struct folders folders = { .umask = (uint64_t)umask };
-	struct proc_status status;
+	struct seccomp_counts counts;
 	struct statx st;
 
 	if (umask < 0)
-		folders.umask = proc_status_of(process->status_fd, process->pid, &status) == 0
-					? status.umask
-					: 0;
+		folders.umask = seccomp_counts(process, &counts) == 0 ? counts.umask : 0;
 	for (size_t i = 0; i < sizeof name / sizeof *name; i++)
 		if (proc_look(process->pid, name[i], STATX_INO | STATX_MNT_ID, &st)) {
 			folders.device[i] = device_of(&st);
@@ -172,7 +170,7 @@ static struct folders folders_of(const struct process *process, int32_t umask)
 	return folders;
 }
 
-bool process_has_moved(const struct process *process, int32_t umask)
+bool process_has_moved(struct process *process, int32_t umask)
 {
 	struct folders now;
 

@@ -174,7 +174,7 @@ void process_unhold_soon(struct process *process);
 pid_t process_detach_holder(struct process *process, int *pidfd);
 /* Whether it has other directories, or another umask (-1: to be looked up), than its holder, which
  * its templates get. */
-bool process_has_moved(const struct process *process, int32_t umask);
+bool process_has_moved(struct process *process, int32_t umask);
 /* Makes a stopped process that adopts orphans (PR_SET_CHILD_SUBREAPER) leave them to init.  If we
  * die meanwhile, it resumes by itself. */
 int process_pause_adoption(struct process *process, struct avc_error *err) warn_unused;

@@ -83,16 +83,6 @@ int process_await(struct process *process, struct avc_error *err)
 	return 0;
 }
 
-/* Then no thread is left that could create another one. */
-static bool everybody_stopped(const struct process *process)
-{
-	int stopped = 0;
-
-	for (uint32_t i = 0; i < process->thread_count; i++)
-		stopped += process->threads[i].seen && process->threads[i].stopped;
-	return stopped && proc_thread_count(process->task_dirfd) == stopped;
-}
-
 void process_stop_begin(struct process *process)
 {
 	for (uint32_t i = 0; i < process->thread_count; i++) {
@@ -100,7 +90,7 @@ void process_stop_begin(struct process *process)
 		process->threads[i].block = -1;
 	}
 	process->stage = FREEZE_RUNS;
-	process->filters_seen = false;
+	seccomp_counts_forget(process);
 }
 
 /* Until all are stopped, because threads create threads meanwhile: a walk finds them. */
@@ -111,7 +101,7 @@ static int stop_rest(struct process *process, struct avc_error *err)
 
 		if (process_await(process, err))
 			return -1;
-		if (everybody_stopped(process))
+		if (threads_all_stopped(process))
 			return 0;
 		if (proc_numbers(process->task_dirfd, stop_task, &walk))
 			return err->code ? -1
@@ -166,7 +156,7 @@ int process_stop(struct process *process, struct avc_error *err)
 
 void process_let_go(struct process *process)
 {
-	process->filters_seen = false; /* they may have got some while they were being stopped */
+	seccomp_counts_forget(process); /* some may have changed while it was being stopped */
 	for (uint32_t i = 0; i < process->thread_count; i++)
 		if (is_real_time(&process->threads[i]))
 			thread_let_go(process, &process->threads[i]);

@@ -117,26 +117,6 @@ static int is_clone(struct tree *tree, pid_t pid, struct avc_error *err)
 	return result;
 }
 
-int tree_check_made(const struct tree *tree, bool (*is_known)(pid_t pid, const void *arg),
-		    const void *arg, struct avc_error *err)
-{
-	for (uint32_t i = 0; i < tree->made_count; i++) {
-		int result;
-
-		if (is_known(tree->made[i], arg))
-			continue;
-		result = is_in_parasite(tree, tree->made[i], err);
-		if (result == 0) {
-			tracee_release_strangers();
-			return fail(err, AVC_RETRY, 0, tree->made[i], "look at processes", "",
-				    "it was made while the application was being stopped");
-		}
-		if (result < 0)
-			return -1;
-	}
-	return 0;
-}
-
 /* A zombie; not a main thread that has exited before its threads. */
 static bool is_zombie(const struct proc_stat *stat)
 {
@@ -154,13 +134,38 @@ static bool has_ended(pid_t pid)
 	return is_zombie(&stat);
 }
 
+int tree_check_made(const struct tree *tree, bool (*is_known)(pid_t pid, const void *arg),
+		    const void *arg, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < tree->made_count; i++) {
+		int result;
+
+		if (is_known(tree->made[i], arg) || has_ended(tree->made[i]))
+			continue;
+		result = is_in_parasite(tree, tree->made[i], err);
+		if (result == 0) {
+			tracee_release_strangers();
+			return fail(err, AVC_RETRY, 0, tree->made[i], "look at processes", "",
+				    "it was made while the application was being stopped");
+		}
+		if (result < 0)
+			return -1;
+	}
+	return 0;
+}
+
 /* A child of init that does not belong to the app. */
 static int is_none(struct tree *tree, pid_t pid, struct avc_error *err)
 {
+	const bool later = any_cloning(tree) && tree->made_count < PROCESSES_MAX;
+	int result;
+
 	if (pid == tree_main(tree)->leader || tree->is_ours(pid, tree->arg) ||
-	    (!has_process(tree, pid) && has_ended(pid)))
+	    (!later && !has_process(tree, pid) && has_ended(pid)))
 		return 1;
-	return is_clone(tree, pid, err);
+	result = is_clone(tree, pid, err);
+	/* Most are clones, and need not be looked at twice. */
+	return result || !later ? result : !has_process(tree, pid) && has_ended(pid);
 }
 
 /* Nobody may be left out because we cannot look. */

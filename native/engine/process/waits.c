@@ -29,7 +29,7 @@ static void end(struct process *process, struct thread *thread, timer_t timer)
 {
 	struct avc_error gone = { 0 };
 
-	process->filters_seen = false;
+	seccomp_counts_forget(process);
 	rt_priority_begin();
 	tracee_deadline_set(timer, END_DEADLINE_NS);
 	if (process_check_dying(process, &gone) == 0 && thread_stop(process, thread, &gone) == 0 &&

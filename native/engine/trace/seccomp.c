@@ -105,15 +105,6 @@ long seccomp_suspend_option(void)
 	return confined.is ? 0 : PTRACE_O_SUSPEND_SECCOMP;
 }
 
-bool seccomp_is_containers(const struct proc_status *status, uint32_t containers)
-{
-	const bool is = status->seccomp != SECCOMP_MODE_STRICT &&
-			status->seccomp_filters <= containers;
-
-	confined.met |= confined.is && !is;
-	return is;
-}
-
 static bool parse_counts(const char *text, struct proc_status *status)
 {
 	const char *mode = strstr(text, "\nSeccomp:"), *count = strstr(text, "\nSeccomp_filters:"),
@@ -142,18 +133,75 @@ static int read_counts(pid_t tid, int status_fd, struct proc_status *status)
 	return proc_status(tid, status);
 }
 
-/* It is stopped: nothing but another thread of its process could give it a filter. */
-static int read_confined(const struct process *process, struct thread *thread, int status_fd,
-			 struct avc_error *err)
+int seccomp_counts(struct process *process, struct seccomp_counts *counts)
+{
+	if (!process->counts.known) {
+		/* One that runs could change them, and end. */
+		const bool last = threads_all_stopped(process);
+		struct proc_status status;
+
+		if (read_counts(process->pid, process->status_fd, &status))
+			return -1;
+		process->counts = (struct seccomp_counts){
+			.known = last,
+			.umask = status.umask,
+			.mode = status.seccomp,
+			.filters = status.seccomp_filters,
+		};
+	}
+	*counts = process->counts;
+	return 0;
+}
+
+void seccomp_counts_forget(struct process *process)
+{
+	process->counts.known = process->filters_seen = false;
+}
+
+static int counts_of(struct process *process, struct thread *thread, struct seccomp_counts *counts)
 {
 	struct proc_status status;
 
-	if (read_counts(thread->tid, status_fd, &status))
+	if (thread->tid == process->pid) {
+		if (seccomp_counts(process, counts))
+			return -1;
+	} else {
+		if (read_counts(thread->tid, -1, &status))
+			return -1;
+		*counts = (struct seccomp_counts){ .umask = status.umask,
+						   .mode = status.seccomp,
+						   .filters = status.seccomp_filters };
+	}
+	thread->umask = (int32_t)counts->umask;
+	return 0;
+}
+
+static bool are_containers(const struct seccomp_counts *counts, uint32_t containers)
+{
+	const bool is = counts->mode != SECCOMP_MODE_STRICT && counts->filters <= containers;
+
+	confined.met |= confined.is && !is;
+	return is;
+}
+
+bool seccomp_is_containers(const struct proc_status *status, uint32_t containers)
+{
+	const struct seccomp_counts counts = { .mode = status->seccomp,
+					       .filters = status->seccomp_filters };
+
+	return are_containers(&counts, containers);
+}
+
+/* It is stopped: nothing but another thread of its process could give it a filter. */
+static int read_confined(struct process *process, struct thread *thread, struct avc_error *err)
+{
+	struct seccomp_counts counts;
+
+	if (counts_of(process, thread, &counts))
 		return fail_errno(err, thread->tid, "run injected code", "open(status)",
 				  "it has ended");
-	thread->umask = (int32_t)status.umask;
 	thread->seccomp = process->plain_filters ? SECCOMP_IN_FORCE : SECCOMP_NONE;
-	return seccomp_is_containers(&status, process->plain_filters)
+	return are_containers(&counts, process->plain_filters)
 		       ? 0
 		       : fail(err, AVC_DEADLINE, 0, thread->tid, "run injected code", "",
 			      "it has a seccomp filter of its own now, which takes another guard");
@@ -165,32 +213,30 @@ static long filter_get(pid_t tid, uint32_t index, void *insn)
 }
 
 /* A task without any filter may be in strict mode. */
-static int read_none(struct thread *thread, int status_fd, struct avc_error *err)
+static int read_none(struct process *process, struct thread *thread, struct avc_error *err)
 {
-	struct proc_status status;
+	struct seccomp_counts counts;
 
-	if (read_counts(thread->tid, status_fd, &status))
+	if (counts_of(process, thread, &counts))
 		return fail_errno(err, thread->tid, "run injected code", "open(status)",
 				  "it has ended");
-	thread->umask = (int32_t)status.umask;
 	thread->seccomp = SECCOMP_NONE;
-	return status.seccomp == SECCOMP_MODE_STRICT
+	return counts.mode == SECCOMP_MODE_STRICT
 		       ? fail(err, AVC_UNSUPPORTED, 0, thread->tid, "check", "",
 			      "it is in seccomp's strict mode, which would kill it if the guard "
 			      "died in a checkpoint")
 		       : 0;
 }
 
-int seccomp_read(const struct process *process, struct thread *thread, struct avc_error *err)
+int seccomp_read(struct process *process, struct thread *thread, struct avc_error *err)
 {
-	const int status_fd = thread->tid == process->pid ? process->status_fd : -1;
 	const uint32_t containers = process->plain_filters;
 	bool barred = false, less = false;
 	struct filter p;
 	uint32_t i;
 
 	if (confined.is)
-		return read_confined(process, thread, status_fd, err);
+		return read_confined(process, thread, err);
 	/* Filters are only ever added. */
 	if (thread->filters_known && filter_get(thread->tid, thread->filters_known, NULL) < 0 &&
 	    errno == ENOENT)
@@ -210,7 +256,7 @@ int seccomp_read(const struct process *process, struct thread *thread, struct av
 				  "ptrace(SECCOMP_GET_FILTER)", "its filters cannot be read");
 	containers_filters.known |= i >= containers;
 	if (!i)
-		return read_none(thread, status_fd, err);
+		return read_none(process, thread, err);
 	thread->filters_known = i;
 	thread->seccomp = barred ? SECCOMP_SUPERVISED : less ? SECCOMP_LESS : SECCOMP_IN_FORCE;
 	return 0;
@@ -219,12 +265,11 @@ int seccomp_read(const struct process *process, struct thread *thread, struct av
 /* A guard that cannot read them assumes it of all that are not the container's. */
 static bool has_own(struct process *process)
 {
-	struct proc_status status;
+	struct seccomp_counts counts;
 
 	if (!process->filters_seen)
-		process->filters_own = read_counts(process->pid, process->status_fd, &status) ==
-					       0 &&
-				       !seccomp_is_containers(&status, process->plain_filters);
+		process->filters_own = seccomp_counts(process, &counts) == 0 &&
+				       !are_containers(&counts, process->plain_filters);
 	process->filters_seen = true;
 	return process->filters_own;
 }

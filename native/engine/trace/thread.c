@@ -77,6 +77,15 @@ void threads_forget_unseen(struct process *process)
 	process->thread_count = kept;
 }
 
+bool threads_all_stopped(const struct process *process)
+{
+	int stopped = 0;
+
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		stopped += process->threads[i].seen && process->threads[i].stopped;
+	return stopped && proc_thread_count(process->task_dirfd) == stopped;
+}
+
 /* 0: it is seized after all. EPERM is also the result for an exiting task (kernel/ptrace.c,
  * ptrace_attach), which has no memory any more, or is a zombie. */
 static int seize_failed(pid_t pid, pid_t tid, struct avc_error *err)
