@@ -315,6 +315,7 @@ static int rebuild(struct restore *restore, struct avc_error *err)
 			restore->fork_ns = now_ns() - start;
 		}
 		start = now_ns();
+		attributes_put_back_oom(image->attributes, restore->pid); /* meanwhile */
 		if (await_state(slot, restore->sandbox, restore->pidfd, err))
 			return -1;
 		restore->threads_ns = now_ns() - start;

@@ -592,6 +592,7 @@ static int await_one(struct restore_tree *restored, uint32_t index, struct avc_e
 	struct forked *forked = &restored->forked[index];
 	struct avc_error *notes = &restored->restore->notes;
 
+	attributes_put_back_oom(image->attributes, forked->pid);
 	if (restore_await(image, forked->pidfd, forked->sandbox, err))
 		return -1;
 	restore_note(image, forked->pid, notes);

@@ -456,13 +456,17 @@ static bool has_all(const struct attributes *attributes, pid_t pid)
 	return true;
 }
 
+void attributes_put_back_oom(const struct attributes *attributes, pid_t pid)
+{
+	if (attributes->oom_score_adj[0])
+		proc_set_oom_score_adj(pid, attributes->oom_score_adj);
+}
+
 void attributes_put_back(const struct attributes *attributes, pid_t pid, struct avc_error *notice)
 {
 	struct search search = { .attributes = attributes, .notice = notice };
 	int dirfd;
 
-	if (attributes->oom_score_adj[0])
-		proc_set_oom_score_adj(pid, attributes->oom_score_adj);
 	if (has_all(attributes, pid))
 		return;
 	dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);

@@ -130,7 +130,8 @@ int attributes_setup_thread(const struct process *process, const struct thread *
 			    const struct thread *thread, struct setup *setup,
 			    struct avc_error *err) warn_unused;
 int attributes_keep(struct image *image, struct avc_error *err) warn_unused;
-/* Before the restored threads run: what can only be done from outside. */
+/* Before the restored threads run: what can only be done from outside.  The first at any time before. */
+void attributes_put_back_oom(const struct attributes *attributes, pid_t pid);
 void attributes_put_back(const struct attributes *attributes, pid_t pid, struct avc_error *notice);
 
 /* ---- process_attrs.c ------------------------------------------------------------------------ */
