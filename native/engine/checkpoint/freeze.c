@@ -322,15 +322,16 @@ static int read_and_clone(struct freeze *freeze, struct avc_error *err)
 {
 	struct generation *generation = freeze->generation;
 
-	if (find_others(freeze->tree, generation, err) || freeze_begin_others(freeze, err) ||
-	    keep_all(generation, &freeze->seen, err))
+	if (find_others(freeze->tree, generation, err) || freeze_begin_others(freeze, err))
 		return -1;
 	/* The tables do not change while the kernel clones: no task runs.  While main threads are in
 	 * their parasites: see parasite_set_undo(). */
 	files_capture(generation->image, generation->images);
 	if (!freeze->meet)
 		generation->ends = files_ends_keep_own(generation->image, generation->images);
-	if (dirty_capture(freeze->dirty, generation, err))
+	/* What is mapped cannot be opened while the kernel clones its memory. */
+	if (keep_all(generation, &freeze->seen, err) ||
+	    dirty_capture(freeze->dirty, generation, err))
 		return -1;
 	if (see_alive(freeze->tree, err))
 		return -1;
