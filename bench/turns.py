@@ -43,7 +43,7 @@ def engine(checkout: Path, output: Path, options: argparse.Namespace) -> Figures
 
 def trees(checkout: Path, output: Path, options: argparse.Namespace) -> Figures:
     """bench.trees: process trees."""
-    _run(checkout, "bench.trees", output, "--only", "freeze,restore,workers", options=options)
+    _run(checkout, "bench.trees", output, "--only", options.trees, options=options)
     return {figure["what"]: figure["measured_ms"] for figure in json.loads(output.read_text())}
 
 
@@ -85,6 +85,9 @@ def main() -> int:
     parser.add_argument("--mb", default="100,1000", help="sizes of the process (%(default)s)")
     parser.add_argument("--threads", default="1,20", help="its numbers of threads (%(default)s)")
     parser.add_argument("--only", default="engine,trees", help="some of %(default)s")
+    parser.add_argument(
+        "--trees", default="freeze,restore,workers", help="what of trees, if both know it (%(default)s)"
+    )
     parser.add_argument("--limit", type=float, default=5.0, help="per cent (%(default)s)")
     options = parser.parse_args()
     measures = [{"engine": engine, "trees": trees}[name] for name in options.only.split(",")]
