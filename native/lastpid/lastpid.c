@@ -48,7 +48,6 @@
 /* A process that makes threads asks in quick succession, microseconds apart: spin on the word for a
  * while before sleeping on it. */
 #define SPINS 4000
-#define SPINS_UNKNOWN 400
 #define SLICE_NS 20000000
 #define STAY_SLICES 50
 /* To see that the number was used takes a system call each time. */
@@ -276,9 +275,7 @@ static uint32_t spins_after(const struct inj_slot *slot, int32_t once)
 {
 	if (slot->last_pid == INJ_LAST_PID_FREE || (slot->cpu && slot->cpu == current_cpu()))
 		return 0;
-	if (once)
-		return LOOKS;
-	return slot->cpu ? SPINS : SPINS_UNKNOWN;
+	return once ? LOOKS : SPINS;
 }
 
 static void serve(void)

@@ -640,6 +640,9 @@ static void guard_main(struct avc_guard *guard)
 			continue;
 		}
 		ended = hear(guard, news);
+		/* It may have reported, and ended, since that was looked for. */
+		if (ended && guard->attached && init_channel_report(&guard->channel, &report))
+			guard_app_ended(guard, &report);
 		if (ended)
 			break;
 		if (guard->dead.waits)

@@ -326,6 +326,8 @@ void guard_filter(struct avc_guard *guard);
 /* ---- guard_death.c --------------------------------------------------------- */
 
 void guard_app_died(struct avc_guard *guard, const struct avc_report *report);
+/* init has ended as well, as it does at once when there is nothing to be restored: tells why. */
+void guard_app_ended(struct avc_guard *guard, const struct avc_report *report);
 /* The memory of a dead app is not read any more. */
 void guard_release_remains(struct avc_guard *guard, pid_t pid);
 /* No more than that many are to be left. */

@@ -588,12 +588,22 @@ static void restore_dead(struct avc_guard *guard, const struct avc_report *repor
 	}
 }
 
+static struct policy_verdict judge(const struct avc_guard *guard, const struct avc_report *report)
+{
+	return policy_judge(&guard->config, report->status, report->flags & AVC_REPORT_STOP_ASKED,
+			    guard->restore_asked);
+}
+
+void guard_app_ended(struct avc_guard *guard, const struct avc_report *report)
+{
+	if (!judge(guard, report).restore)
+		guard_app_died(guard, report);
+}
+
 void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 {
 	const uint32_t had = guard->count;
-	const struct policy_verdict verdict = policy_judge(&guard->config, report->status,
-							   report->flags & AVC_REPORT_STOP_ASKED,
-							   guard->restore_asked);
+	const struct policy_verdict verdict = judge(guard, report);
 	struct avc_error none = { 0 };
 
 	rt_priority_begin();
