@@ -28,13 +28,6 @@ bool process_has_executed(const struct process *process)
 	return n == sizeof nonce ? nonce != process->nonce : errno == EFAULT;
 }
 
-void process_listen_no_more(struct process *process)
-{
-	if (process->exec_sign.fd >= 0)
-		munmap(process->exec_sign.page, ARCH_PAGE_BYTES);
-	close_fd(&process->exec_sign.fd);
-}
-
 bool process_listen_for_exec(struct process *process)
 {
 	struct perf_event_attr nothing = {
@@ -59,4 +52,11 @@ bool process_listen_for_exec(struct process *process)
 		return true;
 	close_fd(&sign->fd);
 	return false;
+}
+
+void process_listen_no_more(struct process *process)
+{
+	if (process->exec_sign.fd >= 0)
+		munmap(process->exec_sign.page, ARCH_PAGE_BYTES);
+	close_fd(&process->exec_sign.fd);
 }

@@ -105,32 +105,45 @@ long seccomp_suspend_option(void)
 	return confined.is ? 0 : PTRACE_O_SUSPEND_SECCOMP;
 }
 
-static bool parse_counts(const char *text, struct proc_status *status)
+static struct seccomp_counts counts_in(const struct proc_status *status)
+{
+	return (struct seccomp_counts){ .umask = status->umask,
+					.mode = status->seccomp,
+					.filters = status->seccomp_filters };
+}
+
+static bool parse_counts(const char *text, struct seccomp_counts *counts)
 {
 	const char *mode = strstr(text, "\nSeccomp:"), *count = strstr(text, "\nSeccomp_filters:"),
 		   *umask = strstr(text, "\nUmask:");
 
 	if (!mode || !count || !umask)
 		return false;
-	status->umask = (uint32_t)strtoul(umask + strlen("\nUmask:"), NULL, 8);
-	status->seccomp = (uint32_t)atoi(mode + strlen("\nSeccomp:"));
-	status->seccomp_filters = (uint32_t)atoi(count + strlen("\nSeccomp_filters:"));
+	*counts = (struct seccomp_counts){
+		.umask = (uint32_t)strtoul(umask + strlen("\nUmask:"), NULL, 8),
+		.mode = (uint32_t)atoi(mode + strlen("\nSeccomp:")),
+		.filters = (uint32_t)atoi(count + strlen("\nSeccomp_filters:")),
+	};
 	return true;
 }
 
 /* Only these lines, and from an open file where there is one, because all of this is done while
  * the application is stopped. */
-static int read_counts(pid_t tid, int status_fd, struct proc_status *status)
+static int read_counts(pid_t tid, int status_fd, struct seccomp_counts *counts)
 {
+	struct proc_status status;
 	char text[8192];
 	const ssize_t n = status_fd < 0 ? -1 : pread(status_fd, text, sizeof text - 1, 0);
 
 	if (n > 0) {
 		text[n] = 0;
-		if (parse_counts(text, status))
+		if (parse_counts(text, counts))
 			return 0;
 	}
-	return proc_status(tid, status);
+	if (proc_status(tid, &status))
+		return -1;
+	*counts = counts_in(&status);
+	return 0;
 }
 
 int seccomp_counts(struct process *process, struct seccomp_counts *counts)
@@ -138,16 +151,10 @@ int seccomp_counts(struct process *process, struct seccomp_counts *counts)
 	if (!process->counts.known) {
 		/* One that runs could change them, and end. */
 		const bool last = threads_all_stopped(process);
-		struct proc_status status;
 
-		if (read_counts(process->pid, process->status_fd, &status))
+		if (read_counts(process->pid, process->status_fd, &process->counts))
 			return -1;
-		process->counts = (struct seccomp_counts){
-			.known = last,
-			.umask = status.umask,
-			.mode = status.seccomp,
-			.filters = status.seccomp_filters,
-		};
+		process->counts.known = last;
 	}
 	*counts = process->counts;
 	return 0;
@@ -160,18 +167,9 @@ void seccomp_counts_forget(struct process *process)
 
 static int counts_of(struct process *process, struct thread *thread, struct seccomp_counts *counts)
 {
-	struct proc_status status;
-
-	if (thread->tid == process->pid) {
-		if (seccomp_counts(process, counts))
-			return -1;
-	} else {
-		if (read_counts(thread->tid, -1, &status))
-			return -1;
-		*counts = (struct seccomp_counts){ .umask = status.umask,
-						   .mode = status.seccomp,
-						   .filters = status.seccomp_filters };
-	}
+	if (thread->tid == process->pid ? seccomp_counts(process, counts)
+					: read_counts(thread->tid, -1, counts))
+		return -1;
 	thread->umask = (int32_t)counts->umask;
 	return 0;
 }
@@ -186,8 +184,7 @@ static bool are_containers(const struct seccomp_counts *counts, uint32_t contain
 
 bool seccomp_is_containers(const struct proc_status *status, uint32_t containers)
 {
-	const struct seccomp_counts counts = { .mode = status->seccomp,
-					       .filters = status->seccomp_filters };
+	const struct seccomp_counts counts = counts_in(status);
 
 	return are_containers(&counts, containers);
 }
