@@ -154,20 +154,20 @@ def test_a_checkpoint_that_finds_no_room_leaves_none_of_its_tasks() -> None:
             crowd.wait_beats()
 
 
-def most_are_taken(guard: GuardProcess, tries: int) -> list[str]:
+def most_are_taken(guard: GuardProcess, tries: int, least: float = 0.67) -> list[str]:
     """Of so many checkpoints that are asked for; gives the kinds of all answers."""
     taken = [guard.command("checkpoint", timeout_s=PATIENCE_S)["kind"] for _ in range(tries)]
-    assert taken.count("checkpoint") > tries * 2 // 3, taken
+    assert taken.count("checkpoint") > tries * least, taken
     return taken
 
 
 def test_workers_that_are_killed_and_replaced_all_the_time(tmp_path: Path) -> None:
-    """One of them is nearly always dying, which takes a moment."""
+    """One of them is nearly always dying, which takes a moment, and one new in nearly every freeze."""
     with (
         Victim("crowd renewed 10", tmp_path) as crowd,
         GuardProcess(config(freeze_deadline_s=1.0), [crowd.pid]) as guard,
     ):
-        taken = most_are_taken(guard, 20)
+        taken = most_are_taken(guard, 40, 0.85)
         assert "unprotected" not in taken, taken
         crowd.wait_beats()
 

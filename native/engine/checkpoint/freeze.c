@@ -17,8 +17,12 @@
 /* ---- who there is ------------------------------------------------------------------------- */
 
 /* One that was found while everything was stopped is not infected yet. */
-static int prepare_stopped(struct tree *tree, struct process *process, struct avc_error *err)
+static int prepare_stopped(const struct tree *tree, const struct generation *generation, uint32_t i,
+			   struct avc_error *err)
 {
+	struct process *process = generation->image[i].process;
+	const int above = generation->image[i].parent;
+	const struct process *parent = above >= 0 ? generation->image[above].process : NULL;
 	struct proc_status status;
 
 	if (process->pid != process->leader)
@@ -33,6 +37,7 @@ static int prepare_stopped(struct tree *tree, struct process *process, struct av
 		process->filters = status.seccomp_filters;
 		if (process_infect_stopped(process, tree->slots, err))
 			return -1;
+		memory_expect(process, parent ? parent : tree_main(tree));
 	}
 	return process->files_image ? 0 : files_prepare(process, NULL, err);
 }
@@ -154,8 +159,7 @@ static int find_others(struct tree *tree, struct generation *generation, struct 
 	if (make_images(tree, generation, err))
 		return -1;
 	for (uint32_t i = 1; i < generation->images; i++)
-		if (generation->image[i].process &&
-		    prepare_stopped(tree, generation->image[i].process, err))
+		if (generation->image[i].process && prepare_stopped(tree, generation, i, err))
 			return -1;
 	return 0;
 }

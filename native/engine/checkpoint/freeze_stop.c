@@ -12,6 +12,7 @@
 #define LOOKS 64
 #define LOOK_US 100
 #define ENDS_NS (20 * NS_PER_MS)
+#define TEND_NS (NS_PER_MS / 2)
 
 /* Whether there are threads of the other kind. */
 static bool interrupt(struct tree *tree, bool real_time)
@@ -52,17 +53,19 @@ static int await(const struct tree *tree, int (*wait)(struct process *, struct a
 /* A child that is killed ends within a moment, which is awaited before anything is stopped: where workers
  * are killed and replaced all the time, one of them is nearly always dying.  One whose core is being
  * written takes longer, and must not write it with our priority: nobody else would get a CPU. */
-static int await_dying(const struct process *process, uint64_t end, struct avc_error *err)
+static int await_dying(struct process *process, uint64_t end, struct avc_error *err)
 {
-	const uint64_t now = now_ns();
 	struct avc_error dies = { 0 };
 
 	if (process_check_dying(process, &dies) == 0)
 		return 0;
-	if (process->descendant && now < end && !proc_is_dumping(process->pid)) {
+	if (process->descendant && !proc_is_dumping(process->pid)) {
 		process_hasten(process);
-		if (pidfd_await_end(process->pidfd, end - now))
-			return 0;
+		/* A thread of it that we trace, such as the porter that was killed with it, is reaped by
+		 * us alone, and until then the process does not end. */
+		for (; now_ns() < end; (void)threads_tend_stragglers(process))
+			if (pidfd_await_end(process->pidfd, TEND_NS))
+				return 0;
 		process_hasten_no_more(process);
 	}
 	*err = dies;

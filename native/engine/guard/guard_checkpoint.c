@@ -180,8 +180,13 @@ static int prepare_process(struct avc_guard *guard, uint32_t entry, uint32_t *la
 		process_unhold(process);
 		for (uint32_t i = 0; i < process->thread_count; i++)
 			process->threads[i].known = false;
-		if (infect(guard, process, err))
+		if (infect(guard, process, err)) {
+			/* If it was killed, its threads that we trace are to be reaped. */
+			(void)threads_tend_stragglers(process);
 			return -1;
+		}
+		if (parent)
+			memory_expect(process, parent);
 	}
 	/* Its holder makes calls from memory that the process can write. */
 	if ((process->holder && has_filters_since(process)) || process_has_moved(process, -1))
@@ -196,6 +201,14 @@ static int prepare_process(struct avc_guard *guard, uint32_t entry, uint32_t *la
 	if (!process->holder && !process->adopts && hold(guard, process, err))
 		return -1;
 	return 0;
+}
+
+/* Whatever failed for a child that was killed meanwhile: the freeze handles one that is ending. */
+static bool is_ending(const struct process *process, const struct avc_error *failed)
+{
+	struct avc_error dies = { 0 };
+
+	return failed->code == AVC_GONE || process_check_dying(process, &dies);
 }
 
 static int renew_holders(struct avc_guard *guard, struct avc_error *err)
@@ -261,8 +274,7 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 		process->tcp_moved = guard->main.tcp_moved;
 		if (prepare_process(guard, i, &later, &failed) == 0)
 			continue;
-		/* The freeze handles one that is ending. */
-		if (i == 0 || failed.code != AVC_GONE) {
+		if (i == 0 || !is_ending(process, &failed)) {
 			*err = failed;
 			return -1;
 		}
@@ -296,7 +308,7 @@ static int prepare_files(struct avc_guard *guard, struct avc_error *err)
 
 		if (process &&
 		    files_prepare(process, i ? tree->entry[parent].process : NULL, &failed) &&
-		    (i == 0 || failed.code != AVC_GONE)) {
+		    (i == 0 || !is_ending(process, &failed))) {
 			*err = failed;
 			return -1;
 		}

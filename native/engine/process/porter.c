@@ -127,6 +127,22 @@ bool porter_can_be_thread(void)
 	return can;
 }
 
+/* A process that is killed right then tells of no new thread, which is our tracee all the same: it has
+ * to be waited for, or the process would not end. */
+static int adopt_unseen(int tid, void *arg)
+{
+	struct process *process = arg;
+	struct avc_error ignored = { 0 };
+	struct thread *unseen;
+
+	if (thread_find(process, tid) || !tracee_is_ours(tid))
+		return 0;
+	unseen = thread_add(process, tid, &ignored);
+	if (unseen)
+		unseen->attached = true;
+	return 0;
+}
+
 /* The main thread clones it, and stays in the event's stop. */
 static int make_porter(struct process *process, struct thread *thread, struct porter *porter,
 		       struct avc_error *err)
@@ -161,6 +177,8 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 	if (born < 0) {
 		process->lost = true;
 		thread->stopped = false; /* it runs: in the stub, which must stay, and back */
+		if (porter->is_thread && err->code == AVC_GONE)
+			(void)proc_numbers(process->task_dirfd, adopt_unseen, process);
 		return -1;
 	}
 	if (!born) {

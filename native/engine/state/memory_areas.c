@@ -421,6 +421,41 @@ static int read_areas(struct survey *survey, const struct areas *copied, struct 
 	return result;
 }
 
+/* ---- what a new process has, probably ------------------------------------------------------- */
+
+struct expected {
+	const struct areas *parents;
+	struct areas areas;
+};
+
+static int find_expected(const struct mapping *m, void *arg)
+{
+	struct expected *expected = arg;
+
+	for (uint32_t i = 0; i < expected->parents->count; i++) {
+		const struct area *a = &expected->parents->area[i];
+
+		if (a->start == m->start && a->end == m->end && a->offset == m->offset &&
+		    a->inode == m->inode && area_device(a) == m->device &&
+		    a->protection == mapping_protection(m))
+			return add_area(&expected->areas, a) ? 0 : -1;
+	}
+	return 0;
+}
+
+void memory_expect(struct process *process, const struct process *parent)
+{
+	struct expected expected = { .parents = &parent->memory->areas };
+
+	/* What is missing, or too much, is found after the first clone. */
+	if (expected.parents->count)
+		(void)proc_mappings(process->pid, "maps", find_expected, &expected);
+	areas_free(&process->memory->areas);
+	process->memory->areas = expected.areas;
+}
+
+/* ---- whether that is so --------------------------------------------------------------------- */
+
 static int check_layout(const struct image *image, struct avc_error *err)
 {
 	struct process *process = image->process;

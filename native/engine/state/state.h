@@ -248,6 +248,9 @@ void mem_others_free(struct mem_others *others);
 struct memory *memory_new(void);
 void memory_forget(struct memory *memory); /* it executes another program */
 void memory_free(struct memory *memory);
+/* A process that has just been forked has the shared memory of its parent: which to copy in its first
+ * freeze.  That takes a second freeze for a process of which this is not known. */
+void memory_expect(struct process *process, const struct process *parent);
 /* Allocates memory for what is copied in the freeze. */
 int memory_prepare(const struct process *process, struct mem_image **image, struct mem_seen *seen,
 		   struct avc_error *err) warn_unused;
