@@ -408,6 +408,7 @@ static void let_go(struct freeze *freeze)
 	struct thread *main_thread = thread_find(main, main->pid);
 	struct avc_error ignored = { 0 };
 
+	seccomp_own_forget(main);
 	if (main_thread) {
 		/* A frozen cgroup, at this very moment. */
 		tracee_deadline_set(freeze->timer, NS_PER_S);

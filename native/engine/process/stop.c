@@ -156,12 +156,13 @@ int process_stop(struct process *process, struct avc_error *err)
 
 void process_let_go(struct process *process)
 {
-	seccomp_counts_forget(process); /* some may have changed while it was being stopped */
+	seccomp_own_forget(process);
 	for (uint32_t i = 0; i < process->thread_count; i++)
 		if (is_real_time(&process->threads[i]))
 			thread_let_go(process, &process->threads[i]);
 	for (uint32_t i = 0; i < process->thread_count; i++)
 		thread_let_go(process, &process->threads[i]);
+	seccomp_counts_forget(process); /* now it can change them */
 }
 
 void process_go_on(struct process *process, timer_t timer)

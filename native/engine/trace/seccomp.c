@@ -165,6 +165,11 @@ void seccomp_counts_forget(struct process *process)
 	process->counts.known = process->filters_seen = false;
 }
 
+void seccomp_own_forget(struct process *process)
+{
+	process->filters_seen = false;
+}
+
 static int counts_of(struct process *process, struct thread *thread, struct seccomp_counts *counts)
 {
 	if (thread->tid == process->pid ? seccomp_counts(process, counts)

@@ -461,9 +461,11 @@ void rewind_date(struct thread *thread);
  * tracer. */
 int seccomp_read(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
 /* The umask, the seccomp mode and the number of filters of a stopped process; -1 with errno.  Read once
- * until they are forgotten: when it begins to be stopped, and when it is released. */
+ * until they are forgotten: when it begins to be stopped, and when it runs again. */
 int seccomp_counts(struct process *process, struct seccomp_counts *counts);
 void seccomp_counts_forget(struct process *process);
+/* What was concluded from them while other threads were still running: before it is released. */
+void seccomp_own_forget(struct process *process);
 /* Whether the guard may come under a filter of its own, and still protect an application that has
  * none. */
 bool seccomp_can_be_confined(void);
