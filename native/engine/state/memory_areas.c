@@ -425,22 +425,26 @@ static int read_areas(struct survey *survey, const struct areas *copied, struct 
 
 struct expected {
 	const struct areas *parents;
+	uint32_t next; /* of these, which are ordered by address, as mappings are */
 	struct areas areas;
 };
 
 static int find_expected(const struct mapping *m, void *arg)
 {
 	struct expected *expected = arg;
+	const struct area *a;
 
-	for (uint32_t i = 0; i < expected->parents->count; i++) {
-		const struct area *a = &expected->parents->area[i];
-
-		if (a->start == m->start && a->end == m->end && a->offset == m->offset &&
-		    a->inode == m->inode && area_device(a) == m->device &&
-		    a->protection == mapping_protection(m))
-			return add_area(&expected->areas, a) ? 0 : -1;
-	}
-	return 0;
+	while (expected->next < expected->parents->count &&
+	       expected->parents->area[expected->next].start < m->start)
+		expected->next++;
+	if (expected->next == expected->parents->count)
+		return -1;
+	a = &expected->parents->area[expected->next];
+	if (a->start != m->start || a->end != m->end || a->offset != m->offset ||
+	    a->inode != m->inode || area_device(a) != m->device ||
+	    a->protection != mapping_protection(m))
+		return 0;
+	return add_area(&expected->areas, a) ? 0 : -1;
 }
 
 void memory_expect(struct process *process, const struct process *parent)
