@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import signal
+import statistics
 import subprocess
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -42,6 +44,26 @@ def test_a_lease_on_shared_memory_is_not_broken(tmp_path: Path) -> None:
             victim.wait_beats()
             assert answer["kind"] == "unprotected", answer
             assert "F_SETLEASE" in str(answer["error"])
+
+
+def test_to_look_for_leases_stops_nobody(tmp_path: Path) -> None:
+    """To list locks, the kernel waits for all CPUs to have been idle or in user mode, some 10 ms each time."""
+
+    def list_locks() -> float:
+        time.sleep(0.1)  # right after another one, it waits for nothing
+        start = time.monotonic()
+        Path("/proc/locks").read_bytes()
+        return time.monotonic() - start
+
+    if (listing_s := statistics.median(list_locks() for _ in range(5))) < 0.003:
+        pytest.skip(f"listing locks takes {listing_s * 1e3:.1f} ms here")
+    with Victim("turnover join", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        freezes = []
+        for _ in range(10):
+            time.sleep(0.05)
+            freezes.append(guard.checkpoint()["freeze_s"])
+        victim.check()
+        assert statistics.median(freezes) < listing_s / 2, (listing_s, freezes)
 
 
 def test_a_lease_on_a_mapped_file_is_not_broken(tmp_path: Path, memory: Path) -> None:

@@ -16,13 +16,13 @@
  * was told, in ns; 2: those above 5 ms; 3: above 10 ms; 4: above 18 ms; 5: the kind of the longest;
  * 6: all of them together, in ns; 7: told late on purpose, before the end of the child.
  */
-#include <poll.h>
-#include <pthread.h>
-#include <signal.h>
-#include <spawn.h>
-#include <sched.h>
 #include <linux/futex.h>
 #include <linux/sched.h>
+#include <poll.h>
+#include <pthread.h>
+#include <sched.h>
+#include <signal.h>
+#include <spawn.h>
 #include <sys/resource.h>
 
 #include "victim.h"
@@ -200,6 +200,11 @@ static void pidfd_one(void)
 		CHECK(errno == EINTR, "poll: %s", strerror(errno));
 	note(*ended_ns);
 	must(!waitid((idtype_t)3 /* P_PIDFD */, (id_t)pidfd, &info, WEXITED | WNOHANG), "waitid");
+	if (!info.si_pid) {
+		/* It can be told to a pidfd before its tracer has reaped it. */
+		count(7, 1);
+		must(!waitid((idtype_t)3, (id_t)pidfd, &info, WEXITED), "waitid");
+	}
 	CHECK(info.si_pid == pid && info.si_code == CLD_EXITED && info.si_status == status &&
 		      info.si_signo == SIGCHLD,
 	      "waitid: pid %d code %d status %d", info.si_pid, info.si_code, info.si_status);
@@ -417,33 +422,69 @@ static void detach_one(void)
 	note(*ended_ns);
 }
 
-static const char *const names[] = { "exit",	"kill",	   "threads", "slain",	 "exec",    "thread",
-				     "spawn",	"again",   "pidfd",   "polled",	 "handled", "queued",
-				     "stopped", "session", "orphan",  "headless", "join",    "detach" };
+static const char *const names[] = { "exit",     "kill",   "threads", "slain",   "exec",
+				     "thread",   "spawn",  "again",   "pidfd",   "polled",
+				     "handled",  "queued", "stopped", "session", "orphan",
+				     "headless", "join",   "detach" };
 #define KINDS ((int)(sizeof names / sizeof *names))
 
 static void turn(int kind)
 {
 	kind_now = kind;
 	switch (kind) {
-	case 0: exit_one(0); break;
-	case 1: kill_one(0); break;
-	case 2: exit_one(8); break;
-	case 3: kill_one(8); break;
-	case 4: exec_one(false, "0"); break;
-	case 5: exec_one(true, "0"); break;
-	case 6: spawn_one(); break;
-	case 7: exec_one(false, "4"); break;
-	case 8: pidfd_one(); break;
-	case 9: polled_one(); break;
-	case 10: signalled_one(true); break;
-	case 11: signalled_one(false); break;
-	case 12: stop_one(); break;
-	case 13: session_one(); break;
-	case 14: orphan_one(); break;
-	case 15: headless_one(); break;
-	case 16: join_one(); break;
-	default: detach_one();
+	case 0:
+		exit_one(0);
+		break;
+	case 1:
+		kill_one(0);
+		break;
+	case 2:
+		exit_one(8);
+		break;
+	case 3:
+		kill_one(8);
+		break;
+	case 4:
+		exec_one(false, "0");
+		break;
+	case 5:
+		exec_one(true, "0");
+		break;
+	case 6:
+		spawn_one();
+		break;
+	case 7:
+		exec_one(false, "4");
+		break;
+	case 8:
+		pidfd_one();
+		break;
+	case 9:
+		polled_one();
+		break;
+	case 10:
+		signalled_one(true);
+		break;
+	case 11:
+		signalled_one(false);
+		break;
+	case 12:
+		stop_one();
+		break;
+	case 13:
+		session_one();
+		break;
+	case 14:
+		orphan_one();
+		break;
+	case 15:
+		headless_one();
+		break;
+	case 16:
+		join_one();
+		break;
+	default:
+		detach_one();
 	}
 }
 

@@ -442,7 +442,8 @@ bool mounts_may_be_served(struct mounts *mounts, pid_t pid);
  * no path leads. */
 bool device_is_memory(uint64_t device);
 /* Opening a file breaks a lease (fcntl(2), F_SETLEASE): whoever has it gets SIGIO, which may end it,
- * and who opens waits for it.  Those of all processes, read when first needed; { 0 } before. */
+ * and who opens waits for it.  Those of all processes, read when first needed; { 0 } before.  That
+ * takes the kernel some 10 ms (fs/locks.c: it waits for all CPUs), so before a freeze. */
 struct leases {
 	bool known;
 	uint32_t count, room;
@@ -450,6 +451,7 @@ struct leases {
 		uint64_t device, inode;
 	} * file;
 };
+void leases_read(struct leases *leases);
 void leases_free(struct leases *leases);
 /* The regular file that is mapped so, from its O_PATH descriptor, without an effect on it.  -1 with
  * EACCES: it is a device; ENXIO: it can only be mapped; EBUSY: it is leased (`leases` may be NULL:

@@ -187,14 +187,16 @@ bool device_is_memory(uint64_t device)
 
 /* ---- leases ------------------------------------------------------------------------------- */
 
-static void read_leases(struct leases *leases)
+void leases_read(struct leases *leases)
 {
 	unsigned int major, minor;
 	char *line = NULL;
 	size_t size = 0;
 	unsigned long inode;
-	FILE *locks = got_memory(fopen("/proc/locks", "re"));
+	FILE *locks = leases->known ? NULL : got_memory(fopen("/proc/locks", "re"));
 
+	if (leases->known)
+		return;
 	leases->known = locks != NULL;
 	while (leases->known && getline(&line, &size, locks) > 0) {
 		if (sscanf(line, "%*d: LEASE %*s %*s %*d %x:%x:%lu", &major, &minor, &inode) != 3)
@@ -212,8 +214,7 @@ static void read_leases(struct leases *leases)
 
 static bool is_leased(struct leases *leases, uint64_t device, uint64_t inode)
 {
-	if (!leases->known)
-		read_leases(leases);
+	leases_read(leases);
 	for (uint32_t i = 0; i < leases->count; i++)
 		if (leases->file[i].device == device && leases->file[i].inode == inode)
 			return true;

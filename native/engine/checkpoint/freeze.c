@@ -173,7 +173,8 @@ static int keep(struct image *image, bool strict, struct mem_seen *seen, struct 
 
 	if (process->descendant) {
 		if (strict)
-			image->mapped = files_mapped_prepare(process->pid, process->shm_bytes);
+			image->mapped = files_mapped_prepare(process->pid, process->shm_bytes,
+							     &seen->leases);
 		if (memory_prepare(process, &image->memory, seen, err))
 			return -1;
 		/* Has to wait for its clone; few have any (MADV_WIPEONFORK). */

@@ -54,7 +54,7 @@ static int open_data(pid_t pid, const struct mapping *m, struct mounts *mounts,
 struct look {
 	pid_t pid;
 	struct mounts mounts;
-	struct leases leases;
+	struct leases *leases;
 	struct files_mapped *mapped;
 	uint64_t bytes_left;
 };
@@ -74,7 +74,7 @@ static int take_area(const struct mapping *m, void *arg)
 		.offset = m->offset,
 		.inode = m->inode,
 		.device = m->device,
-		.fd = open_data(look->pid, m, &look->mounts, &look->leases),
+		.fd = open_data(look->pid, m, &look->mounts, look->leases),
 	};
 	if (a->fd < 0)
 		return 0;
@@ -90,10 +90,11 @@ static int take_area(const struct mapping *m, void *arg)
 	return 0;
 }
 
-struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes)
+struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes, struct leases *leases)
 {
 	struct look look = {
 		.pid = pid,
+		.leases = leases,
 		.mapped = calloc(1, sizeof *look.mapped),
 		.bytes_left = limit_bytes,
 	};
@@ -101,7 +102,6 @@ struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes)
 	/* What cannot be read counts as written at a restore. */
 	if (look.mapped)
 		(void)proc_mappings(pid, "maps", take_area, &look);
-	leases_free(&look.leases);
 	mounts_free(&look.mounts);
 	return look.mapped;
 }

@@ -349,7 +349,7 @@ static bool is_watched(const struct avc_guard *guard)
 /* avckpt.files=strict, or auto and a database: from here on, all writes to files are detected.  They
  * count for this generation.  One that was taken before the database was opened knows nothing of its
  * contents. */
-static void watch_files(struct avc_guard *guard, struct generation *fresh)
+static void watch_files(struct avc_guard *guard, struct generation *fresh, struct leases *leases)
 {
 	const bool strict = guard->config.files == AVC_FILES_STRICT;
 	struct image *main = &fresh->image[0];
@@ -367,7 +367,7 @@ static void watch_files(struct avc_guard *guard, struct generation *fresh)
 	if (guard->written)
 		files_written_watch(guard->written, process->pid, strict ? &main->notice : &untold);
 	if (strict)
-		main->mapped = files_mapped_prepare(process->pid, process->shm_bytes);
+		main->mapped = files_mapped_prepare(process->pid, process->shm_bytes, leases);
 }
 
 /* Work that a restore would have to do is done ahead, when the guard is idle. */
@@ -468,7 +468,13 @@ static int prepare_freeze(struct avc_guard *guard, struct freeze *freeze, struct
 	if (prepare_files(guard, err) ||
 	    memory_prepare(main->process, &main->memory, &freeze->seen, err))
 		return -1;
-	watch_files(guard, freeze->generation);
+	/* For those of its children, too, that the freeze finds. */
+	if (guard->config.files == AVC_FILES_STRICT)
+		leases_read(&freeze->seen.leases);
+	for (uint32_t i = 0; i < guard->tree.count; i++)
+		if (guard->tree.entry[i].process)
+			memory_note_leases(guard->tree.entry[i].process, &freeze->seen);
+	watch_files(guard, freeze->generation, &freeze->seen.leases);
 	if (guard->count)
 		dirty_take_spare(&guard->dirty, &guard->generations[guard->count - 1]);
 	dirty_prepare(&guard->dirty, &guard->tree, &guard->config, guard_why_fork(guard),

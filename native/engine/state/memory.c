@@ -230,6 +230,23 @@ int memory_prepare(const struct process *process, struct mem_image **image, stru
 	return 0;
 }
 
+/* System V memory has no descriptors that fcntl(2) could be called with. */
+static bool can_be_leased(const struct area *a)
+{
+	return a->named && a->device == area_device(a);
+}
+
+void memory_note_leases(const struct process *process, struct mem_seen *seen)
+{
+	const struct areas *areas = &process->memory->areas;
+	bool any = false;
+
+	for (uint32_t i = 0; !any && i < areas->count; i++)
+		any = can_be_leased(&areas->area[i]);
+	if (any)
+		leases_read(&seen->leases);
+}
+
 static bool is_area(int path_fd, struct area *a)
 {
 	struct statx st;
@@ -251,7 +268,7 @@ static bool copy_area(pid_t pid, struct area *a, uint8_t *to, struct mem_image *
 	ssize_t n = -1;
 
 	if (path_fd >= 0 && is_area(path_fd, a)) {
-		fd = open_to_read(path_fd, &m, a->named ? &image->seen->leases : NULL);
+		fd = open_to_read(path_fd, &m, can_be_leased(a) ? &image->seen->leases : NULL);
 		image->leased |= fd < 0 && errno == EBUSY;
 	}
 	if (fd >= 0)

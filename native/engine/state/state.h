@@ -251,6 +251,9 @@ void memory_free(struct memory *memory);
 /* A process that has just been forked has the shared memory of its parent: which to copy in its first
  * freeze.  That takes a second freeze for a process of which this is not known. */
 void memory_expect(struct process *process, const struct process *parent);
+/* Which of its shared memory may not be opened in the freeze.  What is leased between this and the
+ * freeze is opened. */
+void memory_note_leases(const struct process *process, struct mem_seen *seen);
 /* Allocates memory for what is copied in the freeze. */
 int memory_prepare(const struct process *process, struct mem_image **image, struct mem_seen *seen,
 		   struct avc_error *err) warn_unused;
