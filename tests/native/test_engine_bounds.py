@@ -161,6 +161,16 @@ def most_are_taken(guard: GuardProcess, tries: int, least: float = 0.67) -> list
     return taken
 
 
+def test_children_that_execute_programs_all_the_time(tmp_path: Path) -> None:
+    """One does in many freezes, which takes another attempt."""
+    with (
+        Victim("turnover exec spawn again", tmp_path) as victim,
+        GuardProcess(config(freeze_deadline_s=1.0), [victim.pid]) as guard,
+    ):
+        most_are_taken(guard, 60, 0.95)
+        victim.wait_beats()
+
+
 def test_workers_that_are_killed_and_replaced_all_the_time(tmp_path: Path) -> None:
     """One of them is nearly always dying, which takes a moment, and one new in nearly every freeze."""
     with (

@@ -162,8 +162,7 @@ void files_ends_mend_own(struct group_ends *ends, struct image *image, uint32_t 
 
 /* files_mapped.c: contents of files that are mapped for writing.  Before a freeze; NULL: out of
  * memory. */
-struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes,
-					  struct leases *leases);
+struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes, struct leases *leases);
 /* While everything is stopped; NULL: nothing. */
 void files_mapped_copy(struct files_mapped *mapped);
 void files_mapped_free(struct files_mapped *mapped);
