@@ -171,6 +171,20 @@ def test_children_that_execute_programs_all_the_time(tmp_path: Path) -> None:
         victim.wait_beats()
 
 
+def test_a_child_that_is_killed_ends_at_once(tmp_path: Path) -> None:
+    """Its threads that are traced just then have to be reaped, before the guard does anything that takes long."""
+    with (
+        Victim("turnover kill slain stopped --in-child", tmp_path) as victim,
+        GuardProcess(config(freeze_deadline_s=1.0), [victim.pid]) as guard,
+    ):
+        for _ in range(150):
+            guard.command("checkpoint")
+            time.sleep(0.02)
+        told, late = victim.see().counter[0], victim.see().counter[2]
+        victim.check()
+        assert late <= 6, f"{late} of {told} ends were told after more than 5 ms"
+
+
 def test_workers_that_are_killed_and_replaced_all_the_time(tmp_path: Path) -> None:
     """One of them is nearly always dying, which takes a moment, and one new in nearly every freeze."""
     with (

@@ -15,6 +15,8 @@
 #define TEMPLATE_NS (20 * NS_PER_MS) /* to make one ready, where there are many         */
 #define LOOK_NS (100 * NS_PER_MS)
 #define TAKE_TRIES 4
+#define SEE_OFF_NS (5 * NS_PER_MS)
+#define SEE_OFF_STEP_NS (NS_PER_MS / 5)
 #define VFORK_NS (2 * NS_PER_S)
 #define HOMEWARD_NS (2 * NS_PER_S)
 /* So many new threads are asked in the freeze, where each makes it longer by some 0.05 ms.  More are
@@ -180,11 +182,8 @@ static int prepare_process(struct avc_guard *guard, uint32_t entry, uint32_t *la
 		process_unhold(process);
 		for (uint32_t i = 0; i < process->thread_count; i++)
 			process->threads[i].known = false;
-		if (infect(guard, process, err)) {
-			/* If it was killed, its threads that we trace are to be reaped. */
-			(void)threads_tend_stragglers(process);
+		if (infect(guard, process, err))
 			return -1;
-		}
 		if (parent)
 			memory_expect(process, parent);
 	}
@@ -209,6 +208,16 @@ static bool is_ending(const struct process *process, const struct avc_error *fai
 	struct avc_error dies = { 0 };
 
 	return failed->code == AVC_GONE || process_check_dying(process, &dies);
+}
+
+/* Its threads that we trace are reaped by us alone, and its parent, which waits for it, runs.  A thread
+ * that is being killed takes a moment to get that far. */
+static void see_off(struct process *process)
+{
+	const uint64_t end = now_ns() + SEE_OFF_NS;
+
+	while (threads_tend_stragglers(process) && now_ns() < end)
+		(void)pidfd_await_end(process->pidfd, SEE_OFF_STEP_NS);
 }
 
 static int renew_holders(struct avc_guard *guard, struct avc_error *err)
@@ -278,6 +287,7 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 			*err = failed;
 			return -1;
 		}
+		see_off(process);
 	}
 	return 0;
 }
