@@ -185,6 +185,16 @@ def test_a_child_that_is_killed_ends_at_once(tmp_path: Path) -> None:
         assert late <= 4, f"{late} of {told} ends were told after more than 10 ms"
 
 
+def test_children_that_are_stopped_and_continued_all_the_time(tmp_path: Path) -> None:
+    """SIGCONT for one whose thread makes calls of ours stops that thread once more."""
+    with (
+        Victim("turnover stopped", tmp_path) as victim,
+        GuardProcess(config(freeze_deadline_s=1.0), [victim.pid]) as guard,
+    ):
+        most_are_taken(guard, 100, 0.975)
+        victim.wait_beats()
+
+
 def test_workers_that_are_killed_and_replaced_all_the_time(tmp_path: Path) -> None:
     """One of them is nearly always dying, which takes a moment, and one new in nearly every freeze."""
     with (

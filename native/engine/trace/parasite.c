@@ -247,7 +247,9 @@ static int wait_word(struct inj_call *call, uint32_t *word, pid_t tid, struct av
 		tracee_watch(NULL);
 		if (stop.kind == STOP_EXIT || stop.kind == STOP_DYING)
 			return fail(err, AVC_GONE, 0, tid, "run injected code", "", "it has ended");
-		if (stop.kind == STOP_SIGNAL || stop.kind == STOP_GROUP ||
+		/* STOP_TRAP: SIGCONT for a process that was stopped (kernel/signal.c,
+		 * ptrace_trap_notify()). */
+		if (stop.kind == STOP_SIGNAL || stop.kind == STOP_GROUP || stop.kind == STOP_TRAP ||
 		    stop.kind == STOP_SYSCALL)
 			seccomp_go_on(tid, &stop);
 		if (!tracee_has_time(end))
