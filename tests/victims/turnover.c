@@ -14,9 +14,9 @@
  *
  * What each call says of an end is checked.  Counter 0: ends; 1: longest time from an end until that
  * was told, in ns; 2: those above 5 ms; 3: above 10 ms; 4: above 18 ms; 5: the kind of the longest;
- * 6: all of them together, in ns; 7: told late on purpose, before the end of the child.
+ * 6: all of them together, in ns; 7: told by a pidfd before waitid(2) knew; 16 and more: those above
+ * 10 ms, by kind; 36 and more: the longest, by kind.
  */
-#include <linux/futex.h>
 #include <linux/sched.h>
 #include <poll.h>
 #include <pthread.h>
@@ -145,7 +145,23 @@ static void *execute(void *arg)
 	_exit(98);
 }
 
-static void exec_one(bool by_thread, const char *times)
+static void exec_one(int times)
+{
+	const int status = a_status();
+	const pid_t pid = fork_one();
+	char text[12], left[12];
+
+	if (!pid) {
+		snprintf(text, sizeof text, "%d", status);
+		snprintf(left, sizeof left, "%d", times);
+		execl(self, self, "--leave", text, left, NULL);
+		_exit(98);
+	}
+	reap(pid, status, 0);
+	note(*ended_ns);
+}
+
+static void thread_one(int threads)
 {
 	const int status = a_status();
 	const pid_t pid = fork_one();
@@ -154,11 +170,7 @@ static void exec_one(bool by_thread, const char *times)
 
 	if (!pid) {
 		snprintf(text, sizeof text, "%d", status);
-		if (!by_thread) {
-			execl(self, self, "--leave", text, times, NULL);
-			_exit(98);
-		}
-		make_threads(2);
+		make_threads(threads);
 		must(!pthread_create(&thread, NULL, execute, text), "pthread_create");
 		pause_for_ever(NULL);
 	}
@@ -166,7 +178,7 @@ static void exec_one(bool by_thread, const char *times)
 	note(*ended_ns);
 }
 
-static void spawn_one(void)
+static void spawn_one(__attribute__((unused)) int arg)
 {
 	const int status = a_status();
 	char text[12], name[] = "--leave", times[] = "0";
@@ -179,7 +191,7 @@ static void spawn_one(void)
 	note(*ended_ns);
 }
 
-static void pidfd_one(void)
+static void pidfd_one(__attribute__((unused)) int arg)
 {
 	int pidfd = -1;
 	struct clone_args args = { .flags = CLONE_PIDFD,
@@ -211,7 +223,7 @@ static void pidfd_one(void)
 	close(pidfd);
 }
 
-static void polled_one(void)
+static void polled_one(__attribute__((unused)) int arg)
 {
 	const int status = a_status();
 	const pid_t pid = fork_one();
@@ -244,7 +256,7 @@ static void check_told(const siginfo_t *info, pid_t pid, int status)
 	      info->si_status, pid);
 }
 
-static void signalled_one(bool handler)
+static void signalled_one(int handler)
 {
 	struct sigaction action = { .sa_sigaction = handle, .sa_flags = SA_SIGINFO }, before;
 	const struct timespec no_time = { 0 };
@@ -293,7 +305,7 @@ static void await_state(pid_t pid, int options, int code, int status)
 	      info.si_status, pid, code, status);
 }
 
-static void stop_one(void)
+static void stop_one(__attribute__((unused)) int arg)
 {
 	const long us = some_us();
 	const pid_t pid = fork_one();
@@ -321,7 +333,7 @@ static void stop_one(void)
 	note(since);
 }
 
-static void session_one(void)
+static void session_one(__attribute__((unused)) int arg)
 {
 	const bool session = next_random(&randomness) & 1;
 	const int status = a_status();
@@ -336,7 +348,7 @@ static void session_one(void)
 	note(*ended_ns);
 }
 
-static void orphan_one(void)
+static void orphan_one(__attribute__((unused)) int arg)
 {
 	const int status = a_status();
 	const pid_t pid = fork_one();
@@ -360,7 +372,7 @@ static void *leave_later(void *arg)
 	return NULL;
 }
 
-static void headless_one(void)
+static void headless_one(__attribute__((unused)) int arg)
 {
 	const int status = a_status();
 	const pid_t pid = fork_one();
@@ -384,7 +396,7 @@ static void *end_thread(void *arg)
 
 static pid_t tid_of;
 
-static void join_one(void)
+static void join_one(__attribute__((unused)) int arg)
 {
 	pthread_t thread;
 	void *result;
@@ -404,7 +416,7 @@ static void *detached(void *arg)
 	return NULL;
 }
 
-static void detach_one(void)
+static void detach_one(__attribute__((unused)) int arg)
 {
 	pthread_attr_t attr;
 	pthread_t thread;
@@ -422,71 +434,22 @@ static void detach_one(void)
 	note(*ended_ns);
 }
 
-static const char *const names[] = { "exit",     "kill",   "threads", "slain",   "exec",
-				     "thread",   "spawn",  "again",   "pidfd",   "polled",
-				     "handled",  "queued", "stopped", "session", "orphan",
-				     "headless", "join",   "detach" };
-#define KINDS ((int)(sizeof names / sizeof *names))
-
-static void turn(int kind)
-{
-	kind_now = kind;
-	switch (kind) {
-	case 0:
-		exit_one(0);
-		break;
-	case 1:
-		kill_one(0);
-		break;
-	case 2:
-		exit_one(8);
-		break;
-	case 3:
-		kill_one(8);
-		break;
-	case 4:
-		exec_one(false, "0");
-		break;
-	case 5:
-		exec_one(true, "0");
-		break;
-	case 6:
-		spawn_one();
-		break;
-	case 7:
-		exec_one(false, "4");
-		break;
-	case 8:
-		pidfd_one();
-		break;
-	case 9:
-		polled_one();
-		break;
-	case 10:
-		signalled_one(true);
-		break;
-	case 11:
-		signalled_one(false);
-		break;
-	case 12:
-		stop_one();
-		break;
-	case 13:
-		session_one();
-		break;
-	case 14:
-		orphan_one();
-		break;
-	case 15:
-		headless_one();
-		break;
-	case 16:
-		join_one();
-		break;
-	default:
-		detach_one();
-	}
-}
+static const struct {
+	const char *name;
+	void (*turn)(int arg);
+	int arg;
+} kinds[] = {
+	{ "exit", exit_one, 0 },         { "kill", kill_one, 0 },
+	{ "threads", exit_one, 8 },      { "slain", kill_one, 8 },
+	{ "exec", exec_one, 0 },         { "thread", thread_one, 2 },
+	{ "spawn", spawn_one, 0 },       { "again", exec_one, 4 },
+	{ "pidfd", pidfd_one, 0 },       { "polled", polled_one, 0 },
+	{ "handled", signalled_one, 1 }, { "queued", signalled_one, 0 },
+	{ "stopped", stop_one, 0 },      { "session", session_one, 0 },
+	{ "orphan", orphan_one, 0 },     { "headless", headless_one, 0 },
+	{ "join", join_one, 0 },         { "detach", detach_one, 0 },
+};
+#define KINDS ((int)(sizeof kinds / sizeof *kinds))
 
 /* The page is inherited by descriptor. */
 static volatile uint64_t *map_page(int fd)
@@ -522,14 +485,15 @@ int main(int argc, char **argv)
 	randomness = (uint64_t)getpid() + 1;
 	for (int i = 1; i < argc; i++)
 		for (int k = 0; k < KINDS; k++)
-			if (!strcmp(argv[i], names[k]) || !strcmp(argv[i], "all"))
+			if (!strcmp(argv[i], kinds[k].name) || !strcmp(argv[i], "all"))
 				if (n < KINDS)
 					chosen[n++] = k;
 	must(n > 0, "kinds");
 	victim_ready();
 	for (int i = 0;; i = (i + 1) % n) {
+		kind_now = chosen[i];
 		for (int k = 0; k < TIMES; k++)
-			turn(chosen[i]);
+			kinds[kind_now].turn(kinds[kind_now].arg);
 		beat();
 	}
 }

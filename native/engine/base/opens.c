@@ -193,10 +193,11 @@ void leases_read(struct leases *leases)
 	char *line = NULL;
 	size_t size = 0;
 	unsigned long inode;
-	FILE *locks = leases->known ? NULL : got_memory(fopen("/proc/locks", "re"));
+	FILE *locks;
 
 	if (leases->known)
 		return;
+	locks = got_memory(fopen("/proc/locks", "re"));
 	leases->known = locks != NULL;
 	while (leases->known && getline(&line, &size, locks) > 0) {
 		if (sscanf(line, "%*d: LEASE %*s %*s %*d %x:%x:%lu", &major, &minor, &inode) != 3)
