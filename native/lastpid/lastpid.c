@@ -270,10 +270,12 @@ static void sleep_on(uint32_t *word, uint32_t value, int64_t ns)
 }
 
 /* While it spins, nobody else runs on its CPU: not if that is the one of who has asked, and has to go
- * on first. */
+ * on first; nor once a task has got a wrong number: that is because dead threads still have theirs
+ * until they get a CPU (kernel/exit.c, release_task()), which a real-time task must not keep. */
 static uint32_t spins_after(const struct inj_slot *slot, int32_t once)
 {
-	if (slot->last_pid == INJ_LAST_PID_FREE || (slot->cpu && slot->cpu == current_cpu()))
+	if (slot->last_pid == INJ_LAST_PID_FREE || slot->astray ||
+	    (slot->cpu && slot->cpu == current_cpu()))
 		return 0;
 	return once ? LOOKS : SPINS;
 }
