@@ -7,6 +7,7 @@ but not yet its merge keys. This module adds what is needed for messages.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,9 @@ FILE_BYTES = 1 << 20
 BRACKETS_MOST = 50
 VALUES_MOST = 100_000
 """Most keys and values of a file after expansion of aliases."""
+
+NO_TEXT = re.compile("[\0\ud800-\udfff]")
+"""What an escape in quotes can say, and no path, argument or label can hold."""
 
 
 @dataclass(frozen=True, order=True)
@@ -119,6 +123,10 @@ def _expanded(node: yaml.Node | None, path: Path, known: dict[int, int]) -> int:
     if count == 0:
         raise Unreadable(place_of(node, path), "an anchor that holds itself")
     if count is None:
+        if isinstance(node, yaml.ScalarNode) and (wrong := NO_TEXT.search(node.value)):
+            raise Unreadable(
+                place_of(node, path), f"no text has the character {wrong[0].encode('unicode_escape').decode()}"
+            )
         known[id(node)] = 0
         count = 1
         if isinstance(node, yaml.SequenceNode):

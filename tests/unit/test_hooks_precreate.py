@@ -257,6 +257,7 @@ def test_a_bad_label_fails_and_tells_the_one_who_started_podman(hook: Hook) -> N
     ("key", "hint"),
     [
         ("avckpt_enable", "did you mean avckpt.enable?"),
+        ("avckpt", "did you mean avckpt.enable?"),
         ("avckpt-enable", "did you mean avckpt.enable?"),
         ("AVCKPT.enable", "did you mean avckpt.enable?"),
         ("Avckpt.Restore_On", "did you mean avckpt.restore.on?"),

@@ -14,7 +14,7 @@ from avckpt.cli import commands
 from avckpt.cli.compose import podman_compose
 from avckpt.cli.compose.manifest import Kind, Manifest, Severity, check, files_meant
 from avckpt.errors import ConfigError
-from avckpt_hooks.shared.labels import LABELS
+from avckpt_hooks.shared.labels import LABELS, parse_policy
 from click.testing import CliRunner
 
 SHARED = """\
@@ -85,6 +85,8 @@ def test_maps_lists_annotations_anchors_and_merge_keys(path: Path) -> None:
         ("[avckpt.enable: true]", "avckpt.enable: in a list, write it as avckpt.enable=VALUE"),
         ("avckpt.enable=maybe", "label avckpt.enable=maybe: neither true nor false"),
         ("[avckpt_enable=true]", "avckpt_enable is no label of avckpt's; did you mean avckpt.enable?"),
+        ("[avckpt=true]", "avckpt is no label of avckpt's; did you mean avckpt.enable?"),
+        ("{avckpt: {enable: true}}", "avckpt is no label of avckpt's; did you mean avckpt.enable?"),
         ("[avkpt.enable=true]", "avkpt.enable is no label of avckpt's; did you mean avckpt.enable?"),
         ("{Avckpt.Restore-On: exit}", "Avckpt.Restore-On is no label of avckpt's; did you mean avckpt.restore.on?"),
         ("[avckpt.version=1]", "label avckpt.version=1: avckpt sets this itself"),
@@ -201,6 +203,10 @@ def test_labels_elsewhere_are_not_the_containers(path: Path, where: str) -> None
         ("- a\n", "v.yaml:1: not a mapping: is this a Compose file?"),
         ("defaults: {}\n", "v.yaml:1: no services: is this a Compose file?"),
         ("", "v.yaml:1: no services: is this a Compose file?"),
+        ("names: {}\n", "v.yaml:1: no services: is this a Compose file? The sidecar's own is checked by avckpt check"),
+        ('services: {a: {image: "x\\0"}}\n', r"v.yaml:1: no text has the character \x00"),
+        ('include: ["x\\0"]\n', r"v.yaml:1: no text has the character \x00"),
+        ('services:\n  "\\ud800": {image: x}\n', r"v.yaml:2: no text has the character \ud800"),
         ("services: &s\n  a: {<<: *s, labels: &l {<<: *l}}\n", "v.yaml:1: an anchor that holds itself"),
         ("services: {a: , d: {labels: }, 5: {labels: {1: 2}}}\n", ""),
         ("services:\n  a: 3\n", "v.yaml:2: service a: a service is a mapping (image: ...): this is none"),
@@ -230,6 +236,45 @@ def test_values_that_podman_compose_cannot_read(path: Path, value: str, problem:
         found = lines(checked(path, text))
         assert len(found) == (1 if problem else 0), found
         assert "".join(found).startswith(f"v.yaml:2: {problem}" if problem else "")
+
+
+def test_what_is_lost_in_a_file_of_something_else(path: Path) -> None:
+    """A warning alone would be no reason for status 1."""
+    found = checked(path, "a: 1\na: 2\n")
+    assert [str(each).rpartition("/")[2] for each in found.errors] == ["v.yaml:1: no services: is this a Compose file?"]
+
+
+@pytest.mark.parametrize(
+    "how", ["{path}", "include: [{path}]", "services: {{a: {{extends: {{file: {path}, service: b}}}}}}"]
+)
+def test_a_loop_of_links_is_a_wrong_file(path: Path, how: str) -> None:
+    loop = path.with_name("loop")
+    loop.symlink_to(loop)
+    file = loop if how == "{path}" else path
+    if file == path:
+        path.write_text(how.format(path=loop) + "\n")
+    status, output = avckpt("check", file)
+    assert status == 1
+    assert f"{loop}: {os.strerror(errno.ELOOP)}\n" in output
+
+
+def test_what_a_file_is_called_moves_no_cursor(tmp_path: Path) -> None:
+    path = tmp_path / "a\n\x1b[2J.yaml"
+    for args in (("check",), ("check", "--config")):
+        path.write_text("3\n")
+        status, output = avckpt(*args, path)
+        assert (status, output.count("\n")) == (1, 2)
+        assert r"a\n\x1b[2J.yaml:1: " in output
+
+
+def test_on_and_off_as_yaml_and_compose_pass_them_on(path: Path) -> None:
+    """Without quotes they are booleans: the containers' labels say True and False."""
+    manifest = checked(path, "services: {a: {labels: {avckpt.io_uring: off, avckpt.mark: on, avckpt.core: on}}}\n")
+    assert manifest.errors == []
+    labels = {key: one.value for key, one in manifest.services["a"].settings[Kind.LABEL].items()}
+    policy = parse_policy(labels)
+    assert (policy.io_uring, policy.mark, policy.core) == (False, True, "on")
+    assert sorted(labels.values()) == ["False", "True", "True"]
 
 
 def avckpt(*args: object) -> tuple[int, str]:

@@ -329,11 +329,18 @@ def _parse_enable(text: str) -> dict[str, Any]:
 
 def _on_or_off(field_name: str) -> Callable[[str], dict[str, Any]]:
     def parse(text: str) -> dict[str, Any]:
-        if text not in ("on", "off"):
+        # Of `off` without quotes YAML makes a boolean, and Compose the label "False".
+        if text.lower() not in _TRUE | _FALSE:
             raise ValueError("neither on nor off")
-        return {field_name: text == "on"}
+        return {field_name: text.lower() in _TRUE}
 
     return parse
+
+
+def _parse_core(text: str) -> dict[str, Any]:
+    if text != "mini" and text.lower() not in _TRUE | _FALSE:
+        raise ValueError("unknown value")
+    return {"core": text if text == "mini" else "on" if text.lower() in _TRUE else "off"}
 
 
 def _parse_interval(text: str) -> dict[str, Any]:
@@ -510,7 +517,7 @@ LABELS: dict[str, Label] = {
     "avckpt.deadline": Label("", f"{_DURATION}, from 1ms to 1h, as 50ms", _parse_deadline),
     "avckpt.deadline.late": Label("go-on", "go-on or cold", _one_of("deadline_late", "go-on", "cold")),
     "avckpt.mark": Label("off", "on or off", _on_or_off("mark")),
-    "avckpt.core": Label("off", "off, mini or on", _one_of("core", "off", "mini", "on")),
+    "avckpt.core": Label("off", "off, mini or on", _parse_core),
     "avckpt.scope": Label("container", "container or nodes", _one_of("scope", "container", "nodes")),
     "avckpt.group": Label("", "a name: letters, digits and -_., at most 63", _parse_group),
     "avckpt.group.recovery": Label("apart", "apart or together", _one_of("recovery", "apart", "together")),
@@ -520,7 +527,7 @@ LABELS: dict[str, Label] = {
 """Every label a user may set."""
 
 
-LOOKALIKE = re.compile(r"[avckpt]{5,7}[._-]", re.IGNORECASE)
+LOOKALIKE = re.compile(r"[avckpt]{5,7}(?:[._-]|$)", re.IGNORECASE)
 """Prefixes of names that were meant for us, right or wrong."""
 
 
@@ -529,6 +536,8 @@ def meant_by(name: str) -> str:
     import difflib  # costs milliseconds: not for names unlike ours
 
     plain = name.lower().replace("_", ".").replace("-", ".")
+    if plain == PREFIX.rstrip("."):  # `avckpt=true`, or in YAML a mapping of that name
+        return f"{PREFIX}enable"
     near = difflib.get_close_matches(plain, LABELS, n=1, cutoff=0.9)
     return near[0] if near else ""
 

@@ -82,7 +82,7 @@ def _reported() -> Iterator[None]:
     try:
         yield
     except AvckptError as error:
-        click.echo(f"avckpt: {error}", err=True)
+        click.echo(f"avckpt: {printable(str(error))}", err=True)
         sys.exit(int(error.exit_code))
     except KeyboardInterrupt:
         click.echo("avckpt: interrupted", err=True)
@@ -417,10 +417,10 @@ def run(labels: tuple[str, ...], verbose: bool, argv: tuple[str, ...]) -> None:
         settings = runner.settings_of_run(dict(_split_label(label) for label in labels))
         status = runner.run(settings, list(argv), verbose=verbose)
     except LabelsWrong as error:
-        click.echo(f"avckpt: {error}", err=True)
+        click.echo(f"avckpt: {printable(str(error))}", err=True)
         status = int(ExitCode.USAGE)
     except AvckptError as error:
-        click.echo(f"avckpt: {argv[0]} was not started: {error}", err=True)
+        click.echo(printable(f"avckpt: {argv[0]} was not started: {error}"), err=True)
         status = 125
     sys.exit(status)
 

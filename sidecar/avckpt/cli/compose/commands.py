@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from avckpt_hooks.shared.tell import printable
 
 from avckpt.errors import AvckptError, ConfigError, Denied, ExitCode
 
@@ -203,7 +204,7 @@ def check_config(files: Sequence[Path], as_json: bool) -> ExitCode:
         click.echo(json.dumps({"problems": listed}, indent=2))
     else:
         for problem in problems:
-            click.echo(f"{click.style(str(problem.place), fg='red')}: {problem.message}")
+            click.echo(f"{click.style(printable(str(problem.place)), fg='red')}: {printable(problem.message)}")
         absent = [f"no {path}: the built-in defaults hold" for path in paths if not os.path.exists(path)]
         click.echo(_count(len(problems), "problem") if problems else "\n".join(absent or ["no problems"]))
     return ExitCode.FAILED if problems else ExitCode.OK
@@ -214,7 +215,7 @@ def print_problems(found: Manifest, err: bool = False) -> None:
     for problem in found.problems:
         colour = "red" if problem in found.errors else "yellow"
         place = str(problem.place)
-        click.echo(click.style(place, fg=colour) + str(problem)[len(place) :], err=err)
+        click.echo(click.style(printable(place), fg=colour) + printable(str(problem)[len(place) :]), err=err)
 
 
 def summary(found: Manifest) -> str:
@@ -230,7 +231,7 @@ def summary(found: Manifest) -> str:
         text += f"; depends on the environment: {', '.join(open_ones)}"
     problems = len(found.problems) - len(found.errors)
     counts = [_count(n, what) for n, what in ((len(found.errors), "problem"), (problems, "warning")) if n]
-    return f"{text}; {' and '.join(counts) or 'no problems'}"
+    return printable(f"{text}; {' and '.join(counts) or 'no problems'}")
 
 
 def _compose_files(files: Sequence[Path]) -> tuple[Path, ...]:

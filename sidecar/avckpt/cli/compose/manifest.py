@@ -218,7 +218,9 @@ def check(files: Sequence[Path]) -> Manifest:
         reader.read(reader.queue.pop(0))
     for service in list(manifest.services.values()):
         reader.resolve(service)
-    judge(manifest, "no services: is this a Compose file?")
+    is_sidecars = any(reader.has(files[0], key) for key in ("defaults", "names", "sidecar"))
+    hint = " The sidecar's own is checked by avckpt check --config FILE" if is_sidecars else ""
+    judge(manifest, f"no services: is this a Compose file?{hint}")
     return manifest
 
 
@@ -238,7 +240,7 @@ def judge(manifest: Manifest, nothing: str) -> None:
     wrong = [*doubts.of_order(services), *(() if manifest.is_partial else doubts.of_absent(services))]
     for service, message in wrong:
         manifest.problems.append(Problem(service.place, service.name, message))
-    if nothing and not services and not manifest.problems:
+    if nothing and not services and not manifest.errors:
         manifest.problems.append(Problem(Place(str(manifest.files[0]), 1), "", nothing))
     # What several services share through an anchor is one mistake, not several.
     unique = {(problem.place, problem.message): problem for problem in reversed(manifest.problems)}
@@ -252,7 +254,7 @@ class _Reader:
         self._manifest = manifest
         self.queue: list[Path] = []
         """Files to be read yet."""
-        self._read: set[Path] = set()
+        self._read: set[str] = set()
         self._roots: dict[Path, yaml.Node | None] = {}
         self._resolved: set[int] = set()
         self._others: dict[Path, dict[str, tuple[yaml.ScalarNode, yaml.Node]]] = {}
@@ -262,9 +264,10 @@ class _Reader:
 
     def read(self, path: Path) -> None:
         """Adds the services of a file, and the files it includes to the queue."""
-        if path.resolve() in self._read:
+        name = os.path.realpath(path)  # which leaves a loop of symbolic links to whoever opens it
+        if name in self._read:
             return
-        self._read.add(path.resolve())
+        self._read.add(name)
         root = self._root(path)
         if root is not None and not isinstance(root, yaml.MappingNode):
             self._complain(yamlfile.place_of(root, path), "not a mapping: is this a Compose file?")
@@ -289,6 +292,10 @@ class _Reader:
                     included = path.parent / one.value
                     self._root(included, yamlfile.place_of(one, path))
                     self.queue.append(included)
+
+    def has(self, path: Path, key: str) -> bool:
+        """Whether a file that was read says something of `key`."""
+        return yamlfile.lookup(self._roots.get(path), key) is not None
 
     def resolve(self, service: Service) -> None:
         """Puts what `service` extends under its own settings."""
