@@ -3,13 +3,19 @@
 
 from __future__ import annotations
 
+import re
+
 from avckpt.containers.protected import Protected, State
 from avckpt.errors import DeadlineMissed
 from avckpt.events.metrics import Metrics
 from avckpt.events.record import EventRecord
-from avckpt.events.vocabulary import Kind, Reason
+from avckpt.events.vocabulary import GAVE_UP_WORDS, Kind, Reason
 from avckpt.policy import settings_of
 from prometheus_client.parser import text_string_to_metric_families
+
+from testkit.harness import ROOT
+
+EXAMPLES = ROOT / "examples" / "prometheus"
 
 
 def samples(text: bytes) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
@@ -71,6 +77,20 @@ def test_what_alerts_ask_for_is_zero_from_the_start() -> None:
         assert value(text, f"avckpt_{histogram}_seconds_count", container="web") == 0
     metrics.forget_all_but([])
     assert b'"web"' not in metrics.render([])
+
+
+def test_the_examples_and_the_series_know_every_death_that_should_have_been_undone() -> None:
+    """A crash loop is one (loop), and so is a restore that was abandoned (late)."""
+    failures = {reason.value for reason in GAVE_UP_WORDS} - {"clean_exit", "stopped", "policy"}
+    for name in ("alerts.yaml", "grafana.json"):
+        text = (EXAMPLES / name).read_text().replace('\\"', '"')
+        (asked,) = re.findall(r'outcome=~"([a-z_|]+)"', text)
+        assert set(asked.split("|")) == failures, name
+    metrics = Metrics("1.0", "1.1")
+    metrics.begin("web")
+    text_of_metrics = metrics.render([])
+    for outcome in failures:
+        assert value(text_of_metrics, "avckpt_restores_total", container="web", reason="signal", outcome=outcome) == 0
 
 
 def container(name: str, state: State, generations: int) -> Protected:

@@ -11,7 +11,7 @@ from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_late
 
 from avckpt.containers.protected import Protected, State
 from avckpt.events.record import EventRecord
-from avckpt.events.vocabulary import Kind, Reason
+from avckpt.events.vocabulary import FAILURES, Kind, Reason
 
 Metric = TypeVar("Metric", Counter, Gauge, Histogram)
 
@@ -101,7 +101,7 @@ class Metrics:
         for histogram in self._longest:
             self._of(histogram, container)
         for cause in UNWANTED:
-            for outcome in (Reason.RESTORED, Reason.LIMIT, Reason.FAILED, Reason.EMPTY):
+            for outcome in (Reason.RESTORED, *FAILURES):
                 self._of(self._restores, container, cause.value, outcome.value)
 
     def take(self, record: EventRecord) -> None:

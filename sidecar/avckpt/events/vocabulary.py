@@ -123,6 +123,9 @@ OUTCOMES = (Reason.RESTORED, *GAVE_UP_WORDS)
 EXPECTED = frozenset({Reason.CLEAN_EXIT, Reason.STOPPED})
 """Intended exits: not worth a warning."""
 
+FAILURES = tuple(reason for reason in GAVE_UP_WORDS if reason not in (*EXPECTED, Reason.POLICY))
+"""Outcomes of deaths that a restore should have undone."""
+
 
 def why_dropped(reason: Reason | None) -> str:
     """Why a generation was dropped, in words."""
