@@ -226,6 +226,13 @@ def test_wrong_usage(args: list[str]) -> None:
     assert avckpt(*args).exit_code == 2
 
 
+def test_a_sidecar_is_started_here_only(tmp_path: Path) -> None:
+    result = avckpt("install", "--sidecar", "--root", str(tmp_path))
+    assert result.exit_code == 2
+    assert "--sidecar is for this host" in result.stderr
+    assert not [*tmp_path.iterdir()]
+
+
 @pytest.mark.parametrize("label", ["avckpt.group=chain", "avckpt.notify.self=signal:USR1"])
 def test_a_plain_program_has_nobody_who_notifies_it(label: str) -> None:
     result = avckpt("run", "-l", label, "--", "true")

@@ -20,7 +20,7 @@ import avckpt
 import avckpt_hooks
 import pytest
 from avckpt import artifacts
-from avckpt.cli import install
+from avckpt.cli import install, sidecar_image
 from avckpt.containers.process import start_time
 from avckpt.errors import ConfigError
 from avckpt_hooks.shared import protocol
@@ -83,6 +83,40 @@ def test_everything_is_in_its_place(root: Path) -> None:
     assert "give one of precreate, prestart, poststop" in done_by.stderr
     conf = (root / "etc/containers/containers.conf.d/50-avckpt.conf").read_text()
     assert conf.endswith('hooks_dir = ["/usr/share/containers/oci/hooks.d", "/usr/local/share/avckpt/oci-hooks.d"]\n')
+
+
+def test_a_unit_that_somebody_has_changed_is_kept_aside(root: Path) -> None:
+    """The shipped one has a line to be uncommented (docs/events.md)."""
+    unit = root / "etc/containers/systemd/avckpt-sidecar.container"
+    assert not [line for line in install.install(root, quadlet=True) if line.startswith("warning")]
+    shipped = unit.read_text()
+    unit.write_text(shipped.replace("#Volume=", "Volume="))
+    [warning] = [line for line in install.install(root) if line.startswith("warning")]
+    assert "is kept as avckpt-sidecar.container.old" in warning
+    aside = unit.with_name(f"{unit.name}.old")
+    assert (unit.read_text(), aside.read_text()) == (shipped, shipped.replace("#Volume=", "Volume="))
+    assert not [line for line in install.install(root) if line.startswith("warning")]
+    install.uninstall(root)
+    assert [path for path in (root / "etc/containers").rglob("*") if path.is_file()] == [aside]
+
+
+def test_an_archive_of_another_image_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where there is one of that name from before, which would run instead."""
+
+    def load(said: str) -> str:
+        done = subprocess.CompletedProcess((), 0, said, "")
+        monkeypatch.setattr(sidecar_image, "podman", lambda *args, **more: done)
+        return sidecar_image.load(tmp_path)
+
+    for said in (
+        "Loaded image: localhost/avckpt-sidecar:latest\n",
+        "Loaded image: localhost/other:1\nLoaded image: localhost/avckpt-sidecar:latest\n",
+        "Loaded image(s): localhost/avckpt-sidecar:latest,localhost/other:1\n",
+    ):
+        assert load(said).startswith("localhost/avckpt-sidecar: loaded")
+    for said in ("Loaded image: localhost/other:1\n", "Loaded image: localhost/avckpt-sidecar-build:latest\n", ""):
+        with pytest.raises(ConfigError, match="holds no image localhost/avckpt-sidecar"):
+            load(said)
 
 
 def test_uninstall_removes_exactly_that(root: Path) -> None:

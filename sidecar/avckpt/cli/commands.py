@@ -192,6 +192,8 @@ def install(*, root: Path, sidecar: bool, archive: Path | None, base: str, quadl
 
     if (archive or base) and not sidecar:
         raise click.UsageError("--archive and --base say how --sidecar gets its image")
+    if sidecar and root != Path("/"):
+        raise click.UsageError("--sidecar is for this host, and --root names another one's file system")
     lines = installer.install(root, quadlet=quadlet)
     if sidecar:
         from avckpt.cli import sidecar_image

@@ -22,6 +22,7 @@ from pathlib import Path
 
 import psutil
 from avckpt_hooks.shared import protocol
+from avckpt_hooks.shared.files import write_at_once
 
 import avckpt
 from avckpt import artifacts
@@ -179,8 +180,9 @@ def install(root: Path = _HOST, *, quadlet: bool = False) -> list[str]:
         line = f"# avckpt: where hooks and sidecar meet\nd {_run_dir()} 0755 root root -\n"
         files.append(_File(TMPFILES, line.encode()))
         done.append(f"{TMPFILES}: makes {_run_dir()} when the machine starts")
+    unit = _File(QUADLET, artifacts.packaging(QUADLET.name).read_bytes())
     if quadlet or QUADLET in before.files:
-        files.append(_File(QUADLET, artifacts.packaging(QUADLET.name).read_bytes()))
+        files.append(unit)
         done.append(f"{QUADLET}: the sidecar as a unit of systemd (Podman 4.4 or newer; systemctl daemon-reload)")
     # Last: from here on Podman calls the hooks.
     directories = containers_conf.with_directory(root, HOOKS_DIR, without=DROP_IN)
@@ -190,6 +192,8 @@ def install(root: Path = _HOST, *, quadlet: bool = False) -> list[str]:
     try:
         with contextlib.ExitStack() as undo:
             writer = _Writer(root, undo)
+            if unit in files and (aside := _set_aside(root, unit, undo)):
+                done.append(f"warning: {QUADLET} was another, which is kept as {aside.name}: yours may have changes")
             for file in files:
                 writer.file(file)
             for path in (_run_dir(), CONFIG_DIR, *_CACHES):
@@ -211,6 +215,21 @@ def install(root: Path = _HOST, *, quadlet: bool = False) -> list[str]:
     environ = os.environ if root == _HOST else {}
     problems = containers_conf.problems(HOOKS_DIR, root, environ) + (service_problems() if root == _HOST else [])
     return done + [f"warning: {line}" for line in problems]
+
+
+def _set_aside(root: Path, file: _File, undo: contextlib.ExitStack) -> Path | None:
+    """Copies what is in its place, and is not the same, beside it.  Raises OSError."""
+    place = under(root, file.path)
+    try:
+        content = place.read_bytes()
+    except FileNotFoundError:
+        return None
+    if content == file.content:
+        return None
+    aside = place.with_name(f"{place.name}.old")  # a suffix that Quadlet does not read
+    undo.callback(aside.unlink, missing_ok=True)
+    write_at_once(str(aside), content, 0o644)
+    return aside
 
 
 def outdated(root: Path = _HOST) -> list[Path]:

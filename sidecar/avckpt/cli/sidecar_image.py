@@ -48,8 +48,9 @@ def build(base: str, say: Callable[[str], None]) -> str:
 
 def load(archive: Path) -> str:
     """Loads the image from what `podman save` has written; what was done.  Raises PodmanFailed, ConfigError."""
-    podman("load", "-i", str(archive), timeout_s=BUILD_S)
-    if podman("image", "exists", IMAGE, check=False).returncode != 0:
+    said = podman("load", "-i", str(archive), timeout_s=BUILD_S).stdout
+    # Not whether there is one of that name: an older one would run instead.
+    if IMAGE not in (word.removesuffix(":latest") for word in said.replace(",", " ").split()):
         raise ConfigError(f"{archive} was loaded, and holds no image {IMAGE}")
     return f"{IMAGE}: loaded from {archive}"
 
