@@ -374,7 +374,8 @@ class Daemon:
             before, name = container.name, self._names.of(container.id, watch.bundle, container.init_pid)
             if name and name != before:
                 container.name = name
-                self.metrics.begin(name)
+                if watch.settings.policy.guarded:
+                    self.metrics.begin(name)
                 self.tell(watch, EventRecord(Kind.CONFIGURED, detail=f"was called {before or 'nothing'} before"))
 
     async def _keep_catching_up(self) -> None:

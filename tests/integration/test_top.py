@@ -101,6 +101,29 @@ def test_a_sidecar_that_goes_and_comes(local: LocalSidecar) -> None:
     driven(local, steps)
 
 
+def test_what_comes_while_the_screen_is_left_is_told_nobody(local: LocalSidecar) -> None:
+    """Its widgets are gone then, but not the loop; the thread's traceback would be on the terminal."""
+
+    async def steps(app: Top, pilot: Pilot[None]) -> None:
+        await pilot.pause()
+        await asyncio.to_thread(app._hand, app.query_one, "#gone")
+
+    driven(local, steps)
+
+
+def test_a_launcher_is_no_unit_that_lacks_protection(local: LocalSidecar) -> None:
+    local.wait_for(local.protected("lidar", SLEEPER, LABELS), state="protected")
+    launcher = local.protected("car", SLEEPER, {"avckpt.enable": "true", "avckpt.scope": "nodes"})
+    local.wait_for(launcher, state="nodes")
+
+    async def steps(app: Top, pilot: Pilot[None]) -> None:
+        await until(pilot, lambda: cells(app, "UNIT") == ["car", "lidar"], "both units")
+        assert "1 of 1 protected" in str(app.query_one("#head").render())
+        assert cells(app, "GENS")[0] == "-"
+
+    driven(local, steps)
+
+
 @pytest.mark.shared_machine("restores and screens on a busy machine may take longer than the test waits")
 def test_only_what_has_changed_is_painted(local: LocalSidecar, monkeypatch: pytest.MonkeyPatch) -> None:
     unit = local.protected("lidar", SLEEPER, ON_COMMAND)

@@ -165,6 +165,75 @@ def test_the_page_gives_commands_when_it_may(local: LocalSidecar, browser: webdr
 
 
 @pytest.mark.shared_machine("a browser on a busy machine may take longer than its driver waits")
+def test_a_page_that_was_first_learns_what_it_may(local: LocalSidecar, browser: webdriver.Chrome) -> None:
+    """Opened while there was no sidecar: it may give commands all the same."""
+    with site(local, "--control") as page:
+        local.stop()
+        browser.get(page.url)
+        wait_text(browser, "#link", "the sidecar")
+        local.start()
+        local.protected("lidar", SLEEPER, LABELS)
+        wait_text(browser, "#units button", "Roll back")
+        wait_text(browser, "#sidecar", "since")
+
+
+@pytest.mark.shared_machine("a browser on a busy machine may take longer than its driver waits")
+@pytest.mark.parametrize("chosen", ["#crashes tbody tr", "#units button"])
+def test_what_is_in_hand_stays_where_it_is(local: LocalSidecar, browser: webdriver.Chrome, chosen: str) -> None:
+    """The focus, when the tables change: rows are not made anew."""
+    lidar = local.protected("lidar", SLEEPER, LABELS)
+    local.wait_for(lidar, state="protected")
+    with site(local, "--control") as page:
+        browser.get(page.url)
+        os.kill(lidar.app_pid, signal.SIGSEGV)
+        wait_text(browser, "#crashes td", "killed by SIGSEGV, restored in")
+        wait_text(browser, chosen, "")
+        browser.execute_script(f"window.chosen = document.querySelector('{chosen}'); chosen.focus()")
+        before = len(texts(browser, "#crashes tr"))
+        local.protected("later", SLEEPER, LABELS)
+        wait_text(browser, "#units td", "later")
+        local.wait_for(lidar, state="protected")
+        os.kill(lidar.app_pid, signal.SIGSEGV)
+        wait_until(lambda: len(texts(browser, "#crashes tr")) > before, PATIENCE_S, "one crash more")
+        assert browser.execute_script("return document.activeElement === window.chosen")
+
+
+@pytest.mark.shared_machine("a browser on a busy machine may take longer than its driver waits")
+def test_a_launcher_is_no_unit_that_lacks_protection(local: LocalSidecar, browser: webdriver.Chrome) -> None:
+    local.wait_for(local.protected("lidar", SLEEPER, LABELS), state="protected")
+    launcher = local.protected("car", SLEEPER, {"avckpt.enable": "true", "avckpt.scope": "nodes"})
+    local.wait_for(launcher, state="nodes")
+    with site(local, "--control") as page:
+        browser.get(page.url)
+        wait_text(browser, "#units td", "car")
+        wait_text(browser, "#tiles", "1 of 1")
+        rows = browser.execute_script(
+            "const rows = [...document.querySelectorAll('#units tbody tr')];"
+            "return rows.map((row) => [...row.cells].map((cell) => cell.textContent))"
+        )
+        assert [(row[0], row[3], bool(row[9])) for row in rows] == [("car", "-", False), ("lidar", "2/2", True)]
+
+
+@pytest.mark.shared_machine("a browser on a busy machine may take longer than its driver waits")
+def test_crashes_stay_when_checkpoints_are_many(local: LocalSidecar, browser: webdriver.Chrome) -> None:
+    with site(local) as page:
+        browser.get(page.url)
+        left = browser.execute_async_script(
+            """
+            const done = arguments[arguments.length - 1];
+            import("/kept.js").then(({kept}) => {
+              const routine = (n) => Array.from({length: n}, () => ({seq: 0}));
+              const all = [{seq: 1}, ...routine(50), {seq: 2}, ...routine(50)];
+              const stored = Array.from({length: 101}, (_, n) => ({seq: n + 1}));
+              done([all.slice(0, 100), all, stored].map((each) => kept(each, 100)).map(
+                (each) => [each.length, each.filter((one) => one.seq).length, each.at(-1).seq]));
+            });
+            """
+        )
+        assert left == [[100, 2, 0], [77, 2, 0], [76, 76, 101]]
+
+
+@pytest.mark.shared_machine("a browser on a busy machine may take longer than its driver waits")
 def test_without_the_token_there_is_a_form(local: LocalSidecar, browser: webdriver.Chrome) -> None:
     with site(local) as page:
         browser.get(page.url.partition("#")[0])
@@ -241,6 +310,9 @@ def test_strangers_keep_nobody_out_and_fill_no_log(local: LocalSidecar) -> None:
 
 def test_a_token_of_the_users_own(local: LocalSidecar, tmp_path: Path) -> None:
     file = tmp_path / "token"
+    said = local.avckpt("web", "--token-file", str(file), check=False)
+    assert said.status == 1
+    assert f"make one: (umask 077; openssl rand -hex 24 > {file})" in said.stderr
     file.write_text("open-sesame-open-sesame\n")
     file.chmod(0o644)
     said = local.avckpt("web", "--port", "0", "--token-file", str(file), check=False)
@@ -260,3 +332,4 @@ def test_without_a_sidecar_it_says_so(tmp_path: Path) -> None:
         said = nobody.avckpt("web", "--port", "0", check=False)
         assert said.status == 3
         assert "the sidecar is not running" in said.stderr
+        assert "start it with: " in said.stderr

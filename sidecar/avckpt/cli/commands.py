@@ -24,7 +24,7 @@ from avckpt_hooks.shared.tell import printable
 from avckpt import __version__
 from avckpt.cli.bundle import bundle
 from avckpt.cli.compose.commands import check, down, up
-from avckpt.cli.events import called, complete_container, completion, events
+from avckpt.cli.events import UNGUARDED, called, complete_container, completion, events
 from avckpt.cli.inspect import inspect
 from avckpt.cli.web import web
 from avckpt.errors import AvckptError, ExitCode
@@ -499,9 +499,9 @@ def _row(c: Json) -> tuple[str, ...]:
     return (
         called(c),
         c["state"],
-        "-" if c["state"] in ("listening", "nodes") else f"{c['generations']}/{c['keep']}",
+        "-" if c["state"] in UNGUARDED else f"{c['generations']}/{c['keep']}",
         f"{c['memory_bytes'] / 1e6:.1f} MB" if c["generations"] else "-",
-        "-" if c["state"] in ("listening", "nodes") else _interval(c),
+        "-" if c["state"] in UNGUARDED else _interval(c),
         "-" if age_s is None else _ago(age_s),
         f"{_ms(c['last_freeze_s'])} {c['last_images']}".rstrip(),
         str(c["restores"]),

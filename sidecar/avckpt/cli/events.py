@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from avckpt.cli.client import Client, Json
 
 RETRY_S = 1.0
+
+UNGUARDED = ("listening", "nodes")
+"""States of those that have no generations of their own, and lack none."""
 """How often somebody who follows looks whether the sidecar is back."""
 
 COLOURS = {

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from avckpt.cli.events import called, complete_container
+from avckpt.cli.events import UNGUARDED, called, complete_container
 
 if TYPE_CHECKING:
     from avckpt.cli.client import Json
@@ -37,7 +37,7 @@ def _lines(known: Json) -> list[str]:
         f"{called(container)} ({container['id'][:12]}): {container['state']}"
         f"{': ' + container['reason'] if container['reason'] else ''}"
     ]
-    if container["state"] not in ("nodes", "listening"):
+    if container["state"] not in UNGUARDED:
         lines += _guarded(known)
     lines.append("settings: " + ", ".join(f"{key}={value}" for key, value in known["settings"].items() if value))
     crashes = known["crashes"][-CRASHES_SHOWN:]

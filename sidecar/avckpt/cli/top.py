@@ -20,11 +20,12 @@ from textual import work
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Vertical
+from textual.css.query import NoMatches
 from textual.screen import ModalScreen
 from textual.widgets import DataTable, Footer, Label, RichLog, Static
 
 from avckpt.cli.commands import STATE_STYLES
-from avckpt.cli.events import COLOURS, RETRY_S, called
+from avckpt.cli.events import COLOURS, RETRY_S, UNGUARDED, called
 from avckpt.errors import AvckptError
 from avckpt.guard import Command
 
@@ -197,7 +198,7 @@ class Top(App[None]):
 
     def _hand(self, callback: Callable[..., object], *args: object) -> None:
         """Calls it in the screen's thread, from another one; does nothing when the screen is being left."""
-        with contextlib.suppress(RuntimeError, CancelledError):
+        with contextlib.suppress(RuntimeError, CancelledError, NoMatches):  # the last: widgets go first
             self.call_from_thread(callback, *args)
 
     def _take(self, event: Json) -> None:
@@ -227,7 +228,7 @@ class Top(App[None]):
 
     def _show(self, rows: list[Json], problem: str) -> None:
         self._rows, self._problem = rows, problem
-        units = [row for row in rows if row["state"] != "listening"]
+        units = [row for row in rows if row["state"] not in UNGUARDED]
         sound = sum(row["state"] == "protected" for row in units)
         restores = sum(row["restores"] for row in rows)
         head = f"[b]avckpt[/b]  {sound} of {len(units)} protected, {restores} restores"
@@ -259,7 +260,7 @@ class Top(App[None]):
         return [
             Text(shortened(called(row), max(self.size.width // 3, NAME_LEAST))),
             Text(row["state"], style=STATE_STYLES.get(row["state"], "")),
-            Text("-" if row["state"] == "listening" else f"{row['generations']}/{row['keep']}"),
+            Text("-" if row["state"] in UNGUARDED else f"{row['generations']}/{row['keep']}"),
             Text("-" if age_s is None else f"{age_s:.1f} s", justify="right"),
             Text(_ms(row["last_freeze_s"]), justify="right"),
             Text(sparkline(seen.freezes_s)),

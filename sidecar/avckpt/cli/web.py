@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from pathlib import Path
 
 import click
 
-from avckpt.errors import ConfigError
+from avckpt.errors import ConfigError, SidecarUnreachable
 
 PORT = 8467
 TOKEN_LEAST = 16
@@ -41,6 +42,7 @@ def web(listen: str, port: int, names: tuple[str, ...], token_file: Path | None,
 
     from avckpt_hooks.shared import protocol
 
+    from avckpt.cli.client import start_it
     from avckpt.web import server
 
     token = secrets.token_urlsafe(24) if token_file is None else read_token(token_file)
@@ -57,7 +59,10 @@ def web(listen: str, port: int, names: tuple[str, ...], token_file: Path | None,
             await runner.cleanup()
 
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(serve())
+        try:
+            asyncio.run(serve())
+        except SidecarUnreachable as error:
+            raise SidecarUnreachable(f"{error}: {start_it(Path(protocol.run_dir()))}") from None
 
 
 def read_token(path: Path) -> str:
@@ -65,7 +70,8 @@ def read_token(path: Path) -> str:
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except OSError as error:
-        raise ConfigError(f"the token cannot be read from {path}", errno=error.errno or 0) from error
+        how = f"; make one: (umask 077; openssl rand -hex 24 > {path})" if error.errno == errno.ENOENT else ""
+        raise ConfigError(f"the token cannot be read from {path} ({error.strerror}){how}") from error
     with os.fdopen(fd, encoding="utf-8", errors="replace") as file:
         if stat.S_IMODE(os.fstat(fd).st_mode) & 0o077:
             raise ConfigError(f"others may read {path}: chmod 600 {path}")

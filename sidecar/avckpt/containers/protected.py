@@ -27,6 +27,11 @@ class State(enum.Enum):
     """The app died; nothing runs at this moment."""
     ENDED = "ended"
 
+    @property
+    def guarded(self) -> bool:
+        """It is to have generations of its own."""
+        return self not in (State.NODES, State.LISTENING)
+
 
 @dataclass
 class Protected:

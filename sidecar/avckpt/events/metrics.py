@@ -141,8 +141,8 @@ class Metrics:
         for gauge in (self._generations, self._memory, self._protected, self._checkpoint_at):
             gauge.clear()
         for container in live:
-            if container.state is State.LISTENING:
-                continue  # it has asked for no protection
+            if not container.state.guarded:
+                continue  # it has asked for no protection, or only its nodes are protected
             self._generations.labels(container.label).set(container.generations)
             if container in measured:
                 self._memory.labels(container.label).set(container.memory_bytes if container.generations else 0)

@@ -210,7 +210,7 @@ def _may_speak(path: Path) -> bool:
     try:
         path.stat()
     except FileNotFoundError:
-        raise SidecarUnreachable(f"the sidecar is not running (no {path}): start it, then this") from None
+        raise SidecarUnreachable(f"the sidecar is not running (no {path})") from None
     except PermissionError:
         return False
     return os.access(path, os.W_OK)

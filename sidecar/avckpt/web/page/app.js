@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The page: asks the API, follows its events, and hands both to what draws them.
 
+import {kept} from "./kept.js";
 import {TimeLine} from "./time_line.js";
 import {drawDistributions, histograms, time} from "./distributions.js";
 
@@ -53,14 +54,22 @@ function node(name, text = "", kind = "") {
 }
 
 const label = (container) => container.name || container.id.slice(0, 12);
-const clock = (at) => new Date(at * 1000).toLocaleTimeString([], {hour12: false});
+/** It has generations of its own: it is neither a launcher of nodes, nor one that only hears of others. */
+const guarded = (container) => container.state !== "listening" && container.state !== "nodes";
+
+/** The time of day, with the date where that is another one: the history outlives a reboot. */
+function clock(at) {
+  const when = new Date(at * 1000);
+  const today = when.toDateString() === new Date().toDateString();
+  return today ? when.toLocaleTimeString([], {hour12: false}) : when.toLocaleString([], {hour12: false});
+}
 
 // ---- what comes ------------------------------------------------------------
 
 function take(event) {
   if (event.seq) state.last = event.seq;
   state.events.push(event);
-  if (state.events.length > KEPT) state.events.splice(0, KEPT / 4);
+  state.events = kept(state.events, KEPT);
   for (const [name, field] of [["restore", "restore_s"], ["lost", "lost_s"], ["freeze", "freeze_s"]]) {
     if (event[field] === undefined) continue;
     const most = (state.most[event.container] ??= {});
@@ -70,11 +79,19 @@ function take(event) {
   if (TOLD.has(event.kind)) due.crashes = true;
 }
 
+/** What the sidecar is, and what this page may do: after each of its starts, also when the page was first. */
+async function about() {
+  const info = await (await ask("/v1/info")).json();
+  state.control = (await (await ask("/v1/access")).json()).control;
+  $("sidecar").textContent = `sidecar ${info.version}, since ${new Date(info.started_at * 1000).toLocaleString()}`;
+}
+
 async function follow() {
   for (;;) {
     try {
       const headers = state.last === null ? {} : {"Last-Event-ID": String(state.last)};
       const answer = await ask("/v1/events?all=1", {headers});
+      await about();
       link("live", "live");
       let rest = "";
       for (const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader(); ;) {
@@ -139,7 +156,7 @@ function frame() {
 }
 
 function drawTiles() {
-  const live = state.containers.filter((each) => each.state !== "ended" && each.state !== "listening");
+  const live = state.containers.filter((each) => each.state !== "ended" && guarded(each));
   const sound = live.filter((each) => each.state === "protected").length;
   const restored = state.events.filter((event) => event.kind === "restored");
   const lost = restored.map((event) => event.lost_s ?? 0).sort((a, b) => a - b);
@@ -159,18 +176,40 @@ function drawTiles() {
   }));
 }
 
+/** Rows that stay are left where they are: a click, the focus and a selection outlive what others do. */
+function settle(body, rows) {
+  const stay = new Set(rows);
+  for (const row of [...body.rows]) if (!stay.has(row)) row.remove();
+  rows.forEach((row, at) => { if (body.rows[at] !== row) body.insertBefore(row, body.rows[at] ?? null); });
+}
+
+const unitRows = new Map();
+const crashRows = new WeakMap();
+
+function unitRow(each) {
+  const row = node("tr");
+  for (const kind of ["", "", "", "number", "number", "number", "number", "number", "", ""]) row.append(node("td", "", kind));
+  row.cells[2].append(node("span"));
+  unitRows.set(each.id, row);
+  return row;
+}
+
 function drawUnits(units) {
-  $("units").tBodies[0].replaceChildren(...units.map((each) => {
-    const row = node("tr");
+  for (const id of unitRows.keys()) if (!state.containers.some((each) => each.id === id)) unitRows.delete(id);
+  settle($("units").tBodies[0], units.map((each) => {
+    const row = unitRows.get(each.id) ?? unitRow(each);
     const age = each.last_checkpoint_at === null ? "-" : `${time(Math.max(0, Date.now() / 1000 - each.last_checkpoint_at))} ago`;
-    row.append(
-      node("td", label(each)), node("td", each.group), node("td"),
-      node("td", each.state === "listening" ? "-" : `${each.generations}/${each.keep}`, "number"),
-      node("td", age, "number"), node("td", time(each.last_freeze_s), "number"),
-      node("td", each.restores, "number"), node("td", time(each.last_restore_s), "number"), node("td", each.reason), node("td"),
-    );
-    row.cells[2].append(node("span", each.state, `state ${each.state}`));
-    if (state.control && each.state !== "listening") row.cells[9].append(...["checkpoint", "restore"].map((what) => command(each, what)));
+    const texts = [label(each), each.group, null, guarded(each) ? `${each.generations}/${each.keep}` : "-", age,
+      time(each.last_freeze_s), String(each.restores), time(each.last_restore_s), each.reason];
+    texts.forEach((text, at) => {
+      if (text !== null && row.cells[at].textContent !== text) row.cells[at].textContent = text;
+    });
+    row.cells[2].firstChild.textContent = each.state;
+    row.cells[2].firstChild.className = `state ${each.state}`;
+    const may = state.control && guarded(each);
+    if (may !== row.cells[9].hasChildNodes()) {
+      row.cells[9].replaceChildren(...(may ? ["checkpoint", "restore"].map((what) => command(each, what)) : []));
+    }
     return row;
   }));
 }
@@ -191,21 +230,28 @@ function command(container, what) {
 
 function drawCrashes() {
   const told = state.events.filter((event) => TOLD.has(event.kind)).slice(-CRASHES).reverse();
-  $("crashes").tBodies[0].replaceChildren(...told.map((event) => {
-    const row = node("tr", "", event === state.chosen ? "chosen" : "");
-    row.append(node("td", clock(event.at), "when"), node("td", event.container), node("td", event.message),
-      node("td", event.lost_s === undefined ? "" : time(event.lost_s), "number"));
-    row.tabIndex = 0;
-    row.addEventListener("click", () => choose(event));
-    row.addEventListener("keydown", (key) => { if (key.key === "Enter") choose(event); });
+  settle($("crashes").tBodies[0], told.map((event) => {
+    const row = crashRows.get(event) ?? crashRow(event);
+    row.className = event === state.chosen ? "chosen" : "";
     return row;
   }));
+}
+
+function crashRow(event) {
+  const row = node("tr");
+  row.append(node("td", clock(event.at), "when"), node("td", event.container), node("td", event.message),
+    node("td", event.lost_s === undefined ? "" : time(event.lost_s), "number"));
+  row.tabIndex = 0;
+  row.addEventListener("click", () => choose(event));
+  row.addEventListener("keydown", (key) => { if (key.key === "Enter") choose(event); });
+  crashRows.set(event, row);
+  return row;
 }
 
 function drawPlots() {
   const whose = $("whose");
   const names = state.containers.filter((each) => each.state !== "ended").map(label).sort();
-  if (whose.options.length !== names.length + 1) {
+  if ([...whose.options].slice(1).map((each) => each.value).join("\n") !== names.join("\n")) {
     const before = whose.value;
     whose.replaceChildren(new Option("all units", ""), ...names.map((name) => new Option(name, name)));
     whose.value = names.includes(before) ? before : "";
@@ -256,9 +302,7 @@ function login() {
 
 async function start() {
   try {
-    const info = await (await ask("/v1/info")).json();
-    state.control = (await (await ask("/v1/access")).json()).control;
-    $("sidecar").textContent = `sidecar ${info.version}, since ${new Date(info.started_at * 1000).toLocaleString()}`;
+    await about();
   } catch (error) {
     if (error instanceof Refused) return login();
     link("lost", error.message);
