@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import IO, Any
 
 import pytest
-from avckpt.cli import client, commands
+from avckpt.cli import client, commands, sidecar_container
 from avckpt.cli.bundle import find
 from avckpt.cli.client import Client
-from avckpt.errors import NoSuchContainer, NothingToRestore
+from avckpt.errors import NoSuchContainer, NothingToRestore, SidecarUnreachable
 from avckpt.guard import Command
 from click.testing import CliRunner, Result
 
@@ -224,6 +224,23 @@ def test_an_answer_that_is_no_sidecars(run_dir: Path) -> None:
 )
 def test_wrong_usage(args: list[str]) -> None:
     assert avckpt(*args).exit_code == 2
+
+
+def test_a_sidecar_that_is_a_service_is_not_asked_for_an_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The Debian package has no image: avckpt up says how its service is started."""
+    absent = subprocess.CompletedProcess((), 1, "", "")
+    monkeypatch.setattr(sidecar_container, "podman", lambda *args, **more: absent)
+    for is_service, how in ((False, "sudo avckpt install --sidecar"), (True, "systemctl start avckpt-sidecar.service")):
+        for module in (client, sidecar_container):
+            monkeypatch.setattr(module, "is_service", lambda is_service=is_service: is_service)
+        with pytest.raises(SidecarUnreachable, match=how):
+            sidecar_container.ensure(tmp_path, print)
+
+
+def test_without_podman_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(SidecarUnreachable, match="there is no podman here"):
+        sidecar_container.ensure(tmp_path, print)
 
 
 def test_a_sidecar_is_started_here_only(tmp_path: Path) -> None:

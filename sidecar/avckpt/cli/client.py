@@ -42,9 +42,14 @@ def start_it(run_dir: Path) -> str:
     sudo = "" if os.geteuid() == 0 else "sudo "
     if not CONFIG_DIR.is_dir():  # it is mounted, and Podman starts nothing without it
         return f"install and start it with: {sudo}avckpt install && {sudo}{run_it(run_dir)}"
-    if any((folder / SERVICE).exists() for folder in UNITS) and os.path.isdir("/run/systemd/system"):
+    if is_service():
         return f"start it with: {sudo}systemctl start {SERVICE}"
     return f"start it with: {sudo}{run_it(run_dir)}"
+
+
+def is_service() -> bool:
+    """Whether it is one of systemd here."""
+    return any((folder / SERVICE).exists() for folder in UNITS) and os.path.isdir("/run/systemd/system")
 
 
 CPU_SHARES = 4096

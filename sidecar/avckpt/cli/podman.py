@@ -16,6 +16,8 @@ def podman(*args: str, check: bool = True, timeout_s: float = 60.0) -> subproces
     """`podman ARGS` to its end.  Raises PodmanFailed; without `check` a status other than 0 is no failure."""
     try:
         done = subprocess.run(["podman", *args], capture_output=True, text=True, check=False, timeout=timeout_s)
+    except FileNotFoundError:
+        raise PodmanFailed(f"podman {args[0]}: there is no podman here (PATH)") from None
     except (OSError, subprocess.TimeoutExpired) as error:
         raise PodmanFailed(f"podman {args[0]}: {error}") from error
     if check and done.returncode != 0:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from avckpt_hooks.shared.protocol import STATE_DIR
 
-from avckpt.cli.client import CPU_SHARES, Client
+from avckpt.cli.client import CPU_SHARES, Client, is_service, start_it
 from avckpt.cli.podman import PodmanFailed, podman
 from avckpt.errors import SidecarUnreachable
 from avckpt.events.system_journal import SOCKET
@@ -68,9 +68,8 @@ def _ensure(run_dir: Path, say: Callable[[str], None]) -> None:
         run_dir.mkdir(mode=0o755, parents=True, exist_ok=True)
         podman("run", "--detach", "--pull=never", "--name", NAME, *options(run_dir), IMAGE)
     else:
-        raise SidecarUnreachable(
-            f"no sidecar is running, and there is no image {IMAGE} to start one from: run sudo avckpt install --sidecar"
-        )
+        how = start_it(run_dir) if is_service() else "run sudo avckpt install --sidecar"
+        raise SidecarUnreachable(f"no sidecar is running, and there is no image {IMAGE} to start one from: {how}")
     _wait(client, f"the container {NAME} was started, and does not answer on {run_dir}/api.sock")
 
 
