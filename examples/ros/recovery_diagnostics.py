@@ -185,6 +185,19 @@ def events(path: str, last_id: str, connected: Callable[[], None]) -> Iterator[t
         connection.close()
 
 
+def needs_no_guard(path: str, container: str) -> bool:
+    """Whether it is a launcher of nodes, or only hears of others: neither has checkpoints, nor lacks them."""
+    connection = UnixConnection(path)
+    try:
+        connection.request("GET", f"/v1/containers/{container}")
+        answer = json.loads(connection.getresponse().read())
+    except (OSError, http.client.HTTPException, ValueError):
+        return False
+    finally:
+        connection.close()
+    return answer.get("container", {}).get("state") in ("nodes", "listening")
+
+
 def follow(path: str, board: Board, changed: Callable[[Status], None], stopped: threading.Event) -> None:
     """Keeps a board up to date and calls changed(status) at each change; comes back to a sidecar that restarts."""
     last_id = ""
@@ -193,6 +206,8 @@ def follow(path: str, board: Board, changed: Callable[[Status], None], stopped: 
         try:
             for event_id, event in events(path, last_id, lambda: board.lose("")):
                 last_id = event_id or last_id
+                if event["kind"] == "registered" and needs_no_guard(path, event["id"]):
+                    continue
                 status = board.take(event)
                 if status is not None and event["at"] >= started:  # what was before is no news
                     changed(status)

@@ -116,6 +116,39 @@ def test_news_of_something_else_hides_no_lack_of_protection(node: ModuleType) ->
     assert [status.level for status in board.statuses(1016.0)] == [node.OK, node.OK]
 
 
+@pytest.mark.parametrize(("state", "known"), [("nodes", False), ("listening", False), ("starting", True)])
+def test_a_launcher_is_no_lasting_warning(node: ModuleType, tmp_path: Path, state: str, known: bool) -> None:
+    """No checkpoint of it ever follows."""
+    path = tmp_path / "api.sock"
+    asked: list[str] = []
+
+    def serve() -> None:
+        for text in (
+            f"id: 41\ndata: {json.dumps(event(Kind.REGISTERED))}\n\n",
+            json.dumps({"container": {"state": state}}),
+        ):
+            connection, _ = server.accept()
+            with connection:
+                asked.append(connection.recv(4096).decode().split()[1])
+                connection.sendall(f"HTTP/1.1 200 OK\r\nContent-Length: {len(text)}\r\n\r\n{text}".encode())
+
+    board, stopped = node.Board(), threading.Event()
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(path))
+        server.listen()
+        threads = [
+            threading.Thread(target=serve, daemon=True),
+            threading.Thread(target=node.follow, args=(str(path), board, print, stopped), daemon=True),
+        ]
+        for thread in threads:
+            thread.start()
+        threads[0].join(10)
+        stopped.set()
+    threads[1].join(20)
+    assert asked == ["/v1/events", f"/v1/containers/{'ab' * 32}"]
+    assert [status.name for status in board.statuses(1000.0)[1:]] == (["avckpt: lidar"] if known else [])
+
+
 def test_it_resumes_where_it_was_when_the_sidecar_comes_back(node: ModuleType, tmp_path: Path) -> None:
     path = tmp_path / "api.sock"
     now = time.time()
