@@ -297,6 +297,26 @@ def test_a_file_that_may_not_be_read_is_a_wrong_file(path: Path, monkeypatch: py
     )
 
 
+@pytest.mark.parametrize("command", ["up", "down"])
+def test_a_file_that_is_named_as_other_commands_take_it(
+    path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    monkeypatch.chdir(path.parent)
+    path.with_name("other.yaml").write_text(SHARED)
+    status, output = avckpt(command, "other.yaml")
+    assert status == 1
+    assert output.endswith("; a file is named with -f other.yaml\n")
+
+
+@pytest.mark.parametrize("command", ["up", "down"])
+def test_what_can_be_read_once_is_no_manifest(path: Path, command: str) -> None:
+    """podman-compose reads it again.  Nobody waits for a writer."""
+    os.mkfifo(path)
+    for file in (path, Path("/dev/stdin")):
+        status, output = avckpt(command, "-f", file)
+        assert (status, output.startswith(f"avckpt: {file} can be read once only")) == (1, True)
+
+
 def test_the_command(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path.write_text(SHARED)
     status, output = avckpt("check", path)

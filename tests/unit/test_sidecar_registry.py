@@ -45,7 +45,13 @@ def test_a_prefix_of_two_is_ambiguous(registry: Registry, called: str) -> None:
         registry.find(called)
 
 
-@pytest.mark.parametrize("called", ["", "we", "webb", "ABC", "f"])
+@pytest.mark.parametrize("called", ["we", "webb", "Web", "web "])
+def test_a_name_that_is_mistyped(registry: Registry, called: str) -> None:
+    with pytest.raises(NoSuchContainer, match=r"did you mean web\? See avckpt ps"):
+        registry.find(called)
+
+
+@pytest.mark.parametrize("called", ["", "ABC", "f", "lidar"])
 def test_nobody_is_called_so(registry: Registry, called: str) -> None:
     with pytest.raises(NoSuchContainer, match=r"avckpt\.enable=true"):
         registry.find(called)

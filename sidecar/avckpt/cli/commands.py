@@ -485,7 +485,8 @@ def _print_table(containers: list[Json]) -> None:
     console = Console(width=width, highlight=False, markup=False)
     with console.capture() as printed:  # it would end with a status of its own when it cannot write
         console.print(table)
-    click.echo(printed.get(), nl=False)
+    for line in printed.get().splitlines():
+        click.echo(line.rstrip())
 
 
 COLUMNS = ("NAME", "STATE", "GENS", "MEMORY", "INTERVAL", "CHECKPOINT", "FREEZE", "RESTORES", "RESTORE", "NOTE")

@@ -73,7 +73,19 @@ def find(containers: Iterable[Protected], name: str) -> Protected:
         if len(matches) > 1:
             ids = ", ".join(container.id[:12] for container in matches)
             raise Ambiguous(f"{name!r} may be any of {ids}: give more digits, or the name")
+    near = _near(candidates, name)
+    if near:
+        raise NoSuchContainer(f"no protected container is called {name!r}: did you mean {near}? See avckpt ps")
     raise NoSuchContainer(
         f"no protected container is called {name!r}: see avckpt ps; was it started with "
         "--label avckpt.enable=true, and are the hooks installed (avckpt doctor)?"
     )
+
+
+def _near(containers: Iterable[Protected], name: str) -> str:
+    """Whose name may have been meant; "" if none looks like it."""
+    import difflib
+
+    names = {container.name.lower(): container.name for container in containers if container.name}
+    close = difflib.get_close_matches(name.strip().lower(), names, n=1, cutoff=0.75)
+    return names[close[0]] if close else ""

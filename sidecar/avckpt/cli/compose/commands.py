@@ -88,7 +88,7 @@ def up(
     from avckpt.cli.compose.podman_compose import Compose
 
     run_dir = Path(protocol.run_dir())
-    paths = _compose_files(files)
+    paths = _compose_files(files, services)
     found = manifest.check(paths)
     print_problems(found, err=True)
     if found.errors:
@@ -142,7 +142,7 @@ def down(
     from avckpt.cli.compose import manifest
     from avckpt.cli.compose.podman_compose import Compose
 
-    paths = _compose_files(files)
+    paths = _compose_files(files, services)
     for path in paths:
         try:
             yamlfile.read(path)
@@ -234,12 +234,18 @@ def summary(found: Manifest) -> str:
     return printable(f"{text}; {' and '.join(counts) or 'no problems'}")
 
 
-def _compose_files(files: Sequence[Path]) -> tuple[Path, ...]:
+def _compose_files(files: Sequence[Path], services: Sequence[str]) -> tuple[Path, ...]:
     """Those that are meant.  Raises ConfigError when there is none, or one of Kubernetes."""
     from avckpt.cli.compose import manifest, pods
 
-    paths = manifest.files_meant(files, os.environ)
+    try:
+        paths = manifest.files_meant(files, os.environ)
+    except ConfigError as error:
+        raise ConfigError(f"{error}{_file_hint(services)}") from None
     for path in paths:
+        # podman-compose opens them once more, with a standard input of its own.
+        if path.is_fifo() or str(path).startswith(("/dev/", "/proc/")):
+            raise ConfigError(f"{path} can be read once only, and podman-compose reads it again: write it to a file")
         if pods.is_pods(path):
             raise ConfigError(f"{path} is for Kubernetes: use podman kube play {path} (and podman kube down)")
     return paths
@@ -249,10 +255,13 @@ def _expect(found: Manifest, services: Sequence[str]) -> None:
     """Raises ConfigError for services that are not in the files."""
     unknown = [name for name in services if name not in found.services]
     if unknown:
-        # What other commands take without it.
-        hint = f"; a file is named with -f {unknown[0]}" if os.path.isfile(unknown[0]) else ""
         there = ", ".join(sorted(found.services))
-        raise ConfigError(f"no such service: {', '.join(unknown)}; there are {there}{hint}")
+        raise ConfigError(f"no such service: {', '.join(unknown)}; there are {there}{_file_hint(unknown)}")
+
+
+def _file_hint(services: Sequence[str]) -> str:
+    """For whoever names a file as other commands take it."""
+    return next((f"; a file is named with -f {name}" for name in services if os.path.isfile(name)), "")
 
 
 def _passed_over(found: Manifest, named: Sequence[str], compose: Compose) -> list[str]:
