@@ -237,6 +237,18 @@ def test_a_sidecar_that_is_a_service_is_not_asked_for_an_image(tmp_path: Path, m
             sidecar_container.ensure(tmp_path, print)
 
 
+def test_a_sidecar_that_is_paused_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Podman's own words for why it cannot be started are about states of containers."""
+
+    def podman(*args: str, **_: object) -> subprocess.CompletedProcess[str]:
+        assert args[0] == "inspect"
+        return subprocess.CompletedProcess(args, 0, json.dumps([{"State": {"Status": "paused"}}]), "")
+
+    monkeypatch.setattr(sidecar_container, "podman", podman)
+    with pytest.raises(SidecarUnreachable, match="is paused, and nothing is protected: podman unpause avckpt-sidecar"):
+        sidecar_container.ensure(tmp_path, print)
+
+
 def test_without_podman_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(SidecarUnreachable, match="there is no podman here"):

@@ -56,6 +56,8 @@ def _ensure(run_dir: Path, say: Callable[[str], None]) -> None:
     if answers(client):
         return
     status = _status()
+    if status == "paused":
+        raise SidecarUnreachable(f"the container {NAME} is paused, and nothing is protected: podman unpause {NAME}")
     if status == "running":
         # It may have been started a moment ago.
         _wait(client, f"the container {NAME} runs, and does not answer on {run_dir}/api.sock")
