@@ -51,6 +51,14 @@ def test_a_name_that_is_mistyped(registry: Registry, called: str) -> None:
         registry.find(called)
 
 
+def test_a_node_that_is_named_without_its_container(registry: Registry) -> None:
+    registry.add(container("dada", "car/lidar", 9))
+    with pytest.raises(NoSuchContainer, match=r"did you mean car/lidar\? See avckpt ps"):
+        registry.find("lidar")
+    with pytest.raises(NoSuchContainer, match=r"avckpt\.enable=true"):
+        registry.find("")
+
+
 @pytest.mark.parametrize("called", ["", "ABC", "f", "lidar"])
 def test_nobody_is_called_so(registry: Registry, called: str) -> None:
     with pytest.raises(NoSuchContainer, match=r"avckpt\.enable=true"):

@@ -87,5 +87,8 @@ def _near(containers: Iterable[Protected], name: str) -> str:
     import difflib
 
     names = {container.name.lower(): container.name for container in containers if container.name}
+    for each in names.values():
+        if each.endswith(f"/{name.strip()}"):  # a node, without its container
+            return each
     close = difflib.get_close_matches(name.strip().lower(), names, n=1, cutoff=0.75)
     return names[close[0]] if close else ""
