@@ -200,18 +200,23 @@ def test_what_is_in_hand_stays_where_it_is(local: LocalSidecar, browser: webdriv
 
 @pytest.mark.shared_machine("a browser on a busy machine may take longer than its driver waits")
 def test_a_launcher_is_no_unit_that_lacks_protection(local: LocalSidecar, browser: webdriver.Chrome) -> None:
-    local.wait_for(local.protected("lidar", SLEEPER, LABELS), state="protected")
+    for name in ("unit10", "unit9"):  # told in the order of their numbers
+        local.wait_for(local.protected(name, SLEEPER, LABELS), state="protected")
     launcher = local.protected("car", SLEEPER, {"avckpt.enable": "true", "avckpt.scope": "nodes"})
     local.wait_for(launcher, state="nodes")
     with site(local, "--control") as page:
         browser.get(page.url)
         wait_text(browser, "#units td", "car")
-        wait_text(browser, "#tiles", "1 of 1")
+        wait_text(browser, "#tiles", "2 of 2")
         rows = browser.execute_script(
             "const rows = [...document.querySelectorAll('#units tbody tr')];"
             "return rows.map((row) => [...row.cells].map((cell) => cell.textContent))"
         )
-        assert [(row[0], row[3] == "-", bool(row[9])) for row in rows] == [("car", True, False), ("lidar", False, True)]
+        assert [(row[0], row[3] == "-", bool(row[9])) for row in rows] == [
+            ("car", True, False),
+            ("unit9", False, True),
+            ("unit10", False, True),
+        ]
 
 
 @pytest.mark.shared_machine("a browser on a busy machine may take longer than its driver waits")

@@ -53,6 +53,8 @@ function node(name, text = "", kind = "") {
   return made;
 }
 
+/** unit9 comes before unit12. */
+const byName = new Intl.Collator(undefined, {numeric: true}).compare;
 const label = (container) => container.name || container.id.slice(0, 12);
 /** It has generations of its own: it is neither a launcher of nodes, nor one that only hears of others. */
 const guarded = (container) => container.state !== "listening" && container.state !== "nodes";
@@ -141,7 +143,7 @@ function shownUnits() {
   return state.containers
     .filter((each) => each.state !== "ended")
     .filter((each) => !wanted || [label(each), each.group, each.state].some((text) => text.toLowerCase().includes(wanted)))
-    .sort((a, b) => a.group.localeCompare(b.group) || label(a).localeCompare(label(b)));
+    .sort((a, b) => byName(a.group, b.group) || byName(label(a), label(b)));
 }
 
 function frame() {
@@ -250,7 +252,7 @@ function crashRow(event) {
 
 function drawPlots() {
   const whose = $("whose");
-  const names = state.containers.filter((each) => each.state !== "ended").map(label).sort();
+  const names = state.containers.filter((each) => each.state !== "ended").map(label).sort(byName);
   if ([...whose.options].slice(1).map((each) => each.value).join("\n") !== names.join("\n")) {
     const before = whose.value;
     whose.replaceChildren(new Option("all units", ""), ...names.map((name) => new Option(name, name)));
