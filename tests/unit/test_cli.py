@@ -16,9 +16,11 @@ from pathlib import Path
 from typing import IO, Any
 
 import pytest
-from avckpt.cli import client, commands, sidecar_container
+from avckpt.cli import client, commands, sidecar_container, sidecar_image
+from avckpt.cli import install as installer
 from avckpt.cli.bundle import find
 from avckpt.cli.client import Client
+from avckpt.cli.podman import PodmanFailed, podman
 from avckpt.errors import NoSuchContainer, NothingToRestore, SidecarUnreachable
 from avckpt.guard import Command
 from click.testing import CliRunner, Result
@@ -235,6 +237,39 @@ def test_a_sidecar_that_is_a_service_is_not_asked_for_an_image(tmp_path: Path, m
             monkeypatch.setattr(module, "is_service", lambda is_service=is_service: is_service)
         with pytest.raises(SidecarUnreachable, match=how):
             sidecar_container.ensure(tmp_path, print)
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ("a\nb\nc\nError: no", "b / c / Error: no"),
+        (
+            "Getting\nError: payload matches no format:\n * oci: no\n * dir: no\n * tar: no",
+            "Error: payload matches no format",
+        ),
+        ("", "exit status 125"),
+    ],
+)
+def test_why_podman_has_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: str, told: str) -> None:
+    (tmp_path / "podman").write_text(f"#!/bin/sh\ncat >&2 <<'END'\n{said}\nEND\nexit 125\n")
+    (tmp_path / "podman").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    with pytest.raises(PodmanFailed) as failure:
+        podman("load")
+    assert str(failure.value) == f"podman load: {told}"
+
+
+def test_what_is_installed_is_told_also_if_the_image_cannot_be_had(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def load(archive: Path) -> str:
+        raise PodmanFailed("it is none")
+
+    monkeypatch.setattr(installer, "install", lambda root, quadlet: ["hooks: in place"])
+    monkeypatch.setattr(sidecar_image, "load", load)
+    (tmp_path / "x.tar").touch()
+    result = avckpt("install", "--sidecar", "--archive", str(tmp_path / "x.tar"))
+    assert (result.exit_code, result.stdout, result.stderr) == (1, "hooks: in place\n", "avckpt: it is none\n")
 
 
 def test_a_sidecar_that_is_paused_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -198,6 +198,9 @@ def install(*, root: Path, sidecar: bool, archive: Path | None, base: str, quadl
     if sidecar:
         from avckpt.cli import sidecar_image
 
+        if not as_json:  # what is done is done, also if the next step fails
+            _print_lines(lines, as_json)
+            lines = []
         image = (
             sidecar_image.load(archive)
             if archive

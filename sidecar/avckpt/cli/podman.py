@@ -21,6 +21,14 @@ def podman(*args: str, check: bool = True, timeout_s: float = 60.0) -> subproces
     except (OSError, subprocess.TimeoutExpired) as error:
         raise PodmanFailed(f"podman {args[0]}: {error}") from error
     if check and done.returncode != 0:
-        lines = (done.stderr or done.stdout).strip().splitlines()[-3:] or [f"exit status {done.returncode}"]
-        raise PodmanFailed(f"podman {args[0]}: {' / '.join(lines)}")
+        raise PodmanFailed(f"podman {args[0]}: {_why(done)}")
     return done
+
+
+def _why(done: subprocess.CompletedProcess[str]) -> str:
+    """The end of what it has said, or its line `Error: ...` where more than that follows."""
+    lines = (done.stderr or done.stdout).strip().splitlines() or [f"exit status {done.returncode}"]
+    errors = [line for line in lines[:-3] if line.startswith("Error: ")]
+    if errors and not any(line.startswith("Error: ") for line in lines[-3:]):
+        return errors[-1].rstrip(":")
+    return " / ".join(lines[-3:])
