@@ -272,6 +272,15 @@ def test_what_is_installed_is_told_also_if_the_image_cannot_be_had(
     assert (result.exit_code, result.stdout, result.stderr) == (1, "hooks: in place\n", "avckpt: it is none\n")
 
 
+@pytest.mark.parametrize("answers", [False, True])
+def test_a_sidecar_that_still_runs_is_told_when_the_hooks_go(monkeypatch: pytest.MonkeyPatch, answers: bool) -> None:
+    monkeypatch.setattr(installer, "uninstall", lambda root: ["removed it"])
+    monkeypatch.setattr(sidecar_container, "answers", lambda client: answers)
+    monkeypatch.setattr(client, "is_service", lambda: False)
+    said = avckpt("uninstall").stdout.splitlines()
+    assert said == ["removed it", *(["left the sidecar, which runs: podman rm -f avckpt-sidecar"] if answers else [])]
+
+
 def test_a_sidecar_that_is_paused_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Podman's own words for why it cannot be started are about states of containers."""
 

@@ -216,8 +216,14 @@ def install(*, root: Path, sidecar: bool, archive: Path | None, base: str, quadl
 def uninstall(root: Path, as_json: bool) -> None:
     """Remove exactly what "avckpt install" put in place."""
     from avckpt.cli import install as installer
+    from avckpt.cli import sidecar_container
+    from avckpt.cli.client import SERVICE, is_service
 
-    _print_lines(installer.uninstall(root), as_json)
+    lines = installer.uninstall(root)
+    if root == Path("/") and sidecar_container.answers(_client()):
+        how = f"systemctl disable --now {SERVICE}" if is_service() else f"podman rm -f {sidecar_container.NAME}"
+        lines.append(f"left the sidecar, which runs: {how}")
+    _print_lines(lines, as_json)
 
 
 @main.command()
