@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import asyncio
+import logging
+import os
 import resource
 import time
 from collections.abc import Iterator
@@ -48,6 +50,12 @@ def raise_descriptor_limit() -> None:
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
+def is_cut_off(run_dir: Path) -> bool:
+    """Whether this is a container of Podman's that has a folder of its own where the host's should be."""
+    mounted = (os.path.ismount(path) for path in (run_dir, *run_dir.parents) if path != Path("/"))
+    return bool(os.environ.get("container")) and not any(mounted)
+
+
 def serve(run_dir: Path, config_path: Path, beat_fd: int = -1) -> None:
     """Runs the sidecar in the foreground until it is asked to stop; gives signs of life on `beat_fd`, if
     given.
@@ -62,6 +70,10 @@ def serve(run_dir: Path, config_path: Path, beat_fd: int = -1) -> None:
         run_dir.mkdir(mode=0o755, parents=True, exist_ok=True)
         with only_one(run_dir) as lock:
             keep_hooks_folders(run_dir)
+            if is_cut_off(run_dir):
+                logging.warning(
+                    "%s is this container's own: no hook reaches it; start it with -v %s:%s", *(run_dir,) * 3
+                )
             asyncio.run(Daemon(run_dir, config_path, beat_fd, lock).run())
     except OSError as error:
         kind = Denied if isinstance(error, PermissionError) else AvckptError

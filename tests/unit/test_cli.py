@@ -23,6 +23,7 @@ from avckpt.cli.client import Client
 from avckpt.cli.podman import PodmanFailed, podman
 from avckpt.errors import NoSuchContainer, NothingToRestore, SidecarUnreachable
 from avckpt.guard import Command
+from avckpt.serve import is_cut_off
 from click.testing import CliRunner, Result
 
 from scripts.man import page
@@ -279,6 +280,19 @@ def test_a_sidecar_that_still_runs_is_told_when_the_hooks_go(monkeypatch: pytest
     monkeypatch.setattr(client, "is_service", lambda: False)
     said = avckpt("uninstall").stdout.splitlines()
     assert said == ["removed it", *(["left the sidecar, which runs: podman rm -f avckpt-sidecar"] if answers else [])]
+
+
+def test_a_sidecar_whose_folder_is_not_the_hosts_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """podman run without -v: it would wait for containers for ever."""
+    for container, mounts, cut_off in (
+        ("podman", {Path("/")}, True),
+        ("podman", {Path("/"), Path("/run/avckpt")}, False),
+        ("podman", {Path("/"), Path("/run")}, False),
+        ("", {Path("/")}, False),
+    ):
+        monkeypatch.setenv("container", container)
+        monkeypatch.setattr(os.path, "ismount", mounts.__contains__)
+        assert is_cut_off(Path("/run/avckpt")) is cut_off
 
 
 def test_a_sidecar_that_is_paused_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
