@@ -53,7 +53,7 @@ def raise_descriptor_limit() -> None:
 def is_cut_off(run_dir: Path) -> bool:
     """Whether this is a container of Podman's that has a folder of its own where the host's should be."""
     mounted = (os.path.ismount(path) for path in (run_dir, *run_dir.parents) if path != Path("/"))
-    return bool(os.environ.get("container")) and not any(mounted)
+    return "container" in os.environ and not any(mounted)
 
 
 def serve(run_dir: Path, config_path: Path, beat_fd: int = -1) -> None:

@@ -288,9 +288,11 @@ def test_a_sidecar_whose_folder_is_not_the_hosts_says_so(monkeypatch: pytest.Mon
         ("podman", {Path("/")}, True),
         ("podman", {Path("/"), Path("/run/avckpt")}, False),
         ("podman", {Path("/"), Path("/run")}, False),
-        ("", {Path("/")}, False),
+        (None, {Path("/")}, False),
     ):
-        monkeypatch.setenv("container", container)
+        monkeypatch.delenv("container", raising=False)
+        if container is not None:
+            monkeypatch.setenv("container", container)
         monkeypatch.setattr(os.path, "ismount", mounts.__contains__)
         assert is_cut_off(Path("/run/avckpt")) is cut_off
 
