@@ -246,7 +246,7 @@ def _judge_installation(facts: Facts) -> Iterator[Check]:
         yield Check("hooks", Status.FAIL, what, f"{remedy}; then run: sudo avckpt install")
         return
     if facts.missing_files:
-        yield Check("hooks", Status.FAIL, f"of the installation is missing: {_few(facts.missing_files)}", again)
+        yield Check("hooks", Status.FAIL, f"a part of the installation is missing: {_few(facts.missing_files)}", again)
     elif facts.hook_problem:
         yield Check("hooks", Status.FAIL, f"{HOOK_PROGRAM} does not run: {facts.hook_problem}", again)
     elif facts.installed_version != avckpt.__version__:
