@@ -518,6 +518,7 @@ static int ask_due(struct process *process, uint64_t stopping_ns, uint32_t *due,
 int process_query_new_threads(struct process *process, timer_t timer, uint64_t deadline_ns,
 			      uint32_t *later, struct avc_error *err)
 {
+	uint64_t stopped_ns = 0;
 	uint32_t due;
 	int result = mark_threads(process, &due, err);
 
@@ -530,6 +531,10 @@ int process_query_new_threads(struct process *process, timer_t timer, uint64_t d
 	while (!result && due) {
 		uint64_t start;
 
+		/* Between two stops it runs for as long: to be stopped for short times only would be of
+		 * no use to it otherwise. */
+		if (stopped_ns)
+			usleep((useconds_t)(stopped_ns / 1000));
 		waits_prepare(process);
 		rt_priority_begin();
 		tracee_deadline_set(timer, deadline_ns);
@@ -538,6 +543,7 @@ int process_query_new_threads(struct process *process, timer_t timer, uint64_t d
 		if (!result)
 			result = ask_due(process, now_ns() - start, &due, err);
 		process_go_on(process, timer);
+		stopped_ns = now_ns() - start;
 	}
 	threads_forget_unseen(process);
 	qsort(process->threads, process->thread_count, sizeof *process->threads, by_inside);
