@@ -25,7 +25,7 @@
 
 #define INJ_MAGIC UINT64_C(0x3130444150545043) /* "CPTPAD01" in memory */
 #define INJ_CODE_BYTES 8192
-#define INJ_SLOTS_OFFSET (INJ_CODE_BYTES + 32768)
+#define INJ_SLOTS_OFFSET (INJ_CODE_BYTES + 40960)
 #define INJ_TIMERS_MAX 64
 #define INJ_CPU_WORDS 16 /* 1024 CPUs */
 #define INJ_CALLS_MAX 96
@@ -105,6 +105,9 @@ struct inj_control {
 	uint64_t cut[INJ_CUT_PLACES];
 	struct inj_call runner __attribute__((aligned(64))); /* a live thread of the app */
 	struct inj_call holder __attribute__((aligned(64)));
+	/* Its own: it is still closing while the children of the process are restored, by lists that
+	 * use `holder` (syscall_batch.c). */
+	struct inj_call late __attribute__((aligned(64)));
 	/* What is left of the app's timers (timers.c). */
 	struct inj_timer timer[INJ_TIMERS_MAX];
 };

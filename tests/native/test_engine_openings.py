@@ -15,6 +15,8 @@ from testkit.harness import wait_until
 
 THOUSANDS = 5000
 """More than LATE_LEAST of files_late.c."""
+WAITS_S = 25.0
+"""Less than a restore waits for what does not come: it goes on without it."""
 LISTENER = 99
 """The descriptor in openings.c."""
 
@@ -46,6 +48,21 @@ def test_nobody_else_has_what_only_one_can_have(kind: str, closes: str, where: s
         assert guard.checkpoint()["kind"] == "checkpoint"
         for _ in range(4):
             open_and_die(guard, victim)
+
+
+@pytest.mark.parametrize("opened", [1300, 3000, 15_000], ids=["before", "at-once", "after"])
+def test_children_are_restored_while_the_rest_is_closed(opened: int, tmp_path: Path) -> None:
+    """That is done before their turn, meanwhile, or after.
+
+    The lists of calls with which they begin lie in their parent's parasite, where its holder has its own.
+    """
+    command = f"openings {opened} pair --parent"
+    with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        for _ in range(4):
+            assert guard.checkpoint()["kind"] == "checkpoint"
+            since = guard.mark()
+            open_and_die(guard, victim)
+            assert guard.wait("restored", since=since)["restore_s"] < WAITS_S
 
 
 def tcp_with_port_of(listener: str) -> int:

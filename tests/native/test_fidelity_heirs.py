@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from testkit.family import kill_main
 from testkit.guarded import GuardProcess, Victim, config, kill_at_random
 from testkit.harness import SLOWNESS, wait_until
 from testkit.scenario import disturb, restored
@@ -36,6 +37,18 @@ def test_what_children_have_from_their_parents(size: str, tmp_path: Path) -> Non
                 disturb(victim)
                 event = restored(victim, guard)
                 assert "error" not in event, event
+
+
+def test_what_a_set_watches_is_registered_again_by_one_of_them(tmp_path: Path) -> None:
+    """All have it, and would remove and add the same at the same time."""
+    with Victim("crowd watched 4 500", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        for _ in range(6):
+            assert guard.checkpoint()["kind"] == "checkpoint"
+            since = guard.mark()
+            kill_main(victim)
+            event = guard.wait("restored", since=since)
+            assert "error" not in event, event
+            victim.wait_beats()
 
 
 @pytest.mark.parametrize("kind", ["kept", "twins", "saved", "for-good"])

@@ -8,10 +8,13 @@
  *   wiped    MANY MB of memory that is wiped in forks (MADV_WIPEONFORK), never touched
  *   named    MANY descriptors of a file, made below the working folder, whose path has 3,000 characters
  *   common   MANY MB of shared memory that all of them have
+ *   watched  nothing of its own, but MANY epoll sets and what they watch from their parent
  *   renewed  nothing: with each beat the oldest of them is killed and replaced
  *   shells   nothing: and there are more of them, shells that run short commands with redirections
  */
 #include <signal.h>
+#include <sys/epoll.h>
+#include <sys/eventfd.h>
 #include <sys/resource.h>
 #include <sys/stat.h>
 #include <sys/wait.h>
@@ -40,6 +43,14 @@ static void open_named(size_t many)
 		must((!mkdir(name, 0700) || errno == EEXIST) && !chdir(name), "mkdir");
 	for (size_t i = 0; i < many; i++)
 		must(open(name, O_RDWR | O_CREAT, 0600) >= 0, "open");
+}
+
+static void open_watched(void)
+{
+	struct epoll_event event = { .events = EPOLLIN };
+	const int set = epoll_create1(0), watched = eventfd(0, 0);
+
+	must(set >= 0 && watched >= 0 && !epoll_ctl(set, EPOLL_CTL_ADD, watched, &event), "epoll");
 }
 
 static void have(const char *kind, size_t many)
@@ -98,6 +109,8 @@ int main(int argc, char **argv)
 	there = map(4096, PROT_READ | PROT_WRITE, MAP_SHARED);
 	if (!strcmp(argv[1], "common"))
 		map(many << 20, PROT_READ | PROT_WRITE, MAP_SHARED);
+	for (size_t i = 0; !strcmp(argv[1], "watched") && i < many; i++)
+		open_watched();
 	for (int i = 0; i < processes; i++) {
 		const pid_t child = fork();
 

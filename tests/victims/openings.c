@@ -1,10 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * openings N KIND [--closes] [--again] [--claims]: SIGUSR1 opens N descriptors of that kind (null, file,
- * eventfd, pair, pipe, tcp; peers: TCP connections with itself).  With --closes a file of its own that
- * was open from the start is closed before.  With --again it closes them and opens them anew, for ever.
- * With --claims it has, too, ports, a name and a lock, and when it was restored takes them again at
- * once.  counter[0] is how often it has opened them.  Beats every 1 ms.
+ * openings N KIND [--closes] [--again] [--claims] [--parent]: SIGUSR1 opens N descriptors of that kind
+ * (null, file, eventfd, pair, pipe, tcp; peers: TCP connections with itself).  With --closes a file of its
+ * own that was open from the start is closed before.  With --again it closes them and opens them anew, for
+ * ever.  With --claims it has, too, ports, a name and a lock, and when it was restored takes them again at
+ * once.  With --parent it has children, which do nothing.  counter[0] is how often it has opened them.
+ * Beats every 1 ms.
  */
 #include <netinet/in.h>
 #include <signal.h>
@@ -23,6 +24,7 @@
 #define LISTENER 99
 #define LOCKED 98
 #define CLAIMS 4
+#define CHILDREN 4
 
 static volatile sig_atomic_t asked;
 
@@ -150,17 +152,27 @@ static void retake_claims(void)
 	leave_claims(fd);
 }
 
+static void have_child(void)
+{
+	const pid_t child = fork();
+
+	must(child >= 0, "fork");
+	while (!child)
+		pause();
+}
+
 int main(int argc, char **argv)
 {
 	const bool closes = victim_flag(&argc, argv, "--closes");
 	const bool with_claims = victim_flag(&argc, argv, "--claims");
 	const bool again = victim_flag(&argc, argv, "--again");
+	const bool parent = victim_flag(&argc, argv, "--parent");
 	struct sigaction act = { .sa_handler = on_signal, .sa_flags = SA_RESTART };
 	struct rlimit limit;
 	uint64_t opened = 0;
 	int claimed[CLAIMS];
 
-	victim_start(&argc, argv, 2, "N KIND [--closes] [--again] [--claims]");
+	victim_start(&argc, argv, 2, "N KIND [--closes] [--again] [--claims] [--parent]");
 	must(!getrlimit(RLIMIT_NOFILE, &limit), "getrlimit");
 	limit.rlim_cur = limit.rlim_max;
 	must(!setrlimit(RLIMIT_NOFILE, &limit), "setrlimit");
@@ -169,6 +181,8 @@ int main(int argc, char **argv)
 	make_listener();
 	if (with_claims)
 		find_claims();
+	for (int i = 0; parent && i < CHILDREN; i++)
+		have_child();
 	sigaction(SIGUSR1, &act, NULL);
 	victim_ready();
 	for (;;) {

@@ -122,13 +122,16 @@ const struct file_watch *files_find_watch(const struct file *now, const struct f
 /* ---- what the restored process has to do ------------------------------------------- */
 
 /* Whether it has to be registered again: an edge since the checkpoint is gone, and a signalfd is
- * bound to the process that registered it. */
-static bool renew(const struct files_work *work, const struct file *n,
+ * bound to the process that registered it.  Where the process has both from the one that forks it, that
+ * one does it: two at a time would remove and add in any order, and one of them finds it there (EEXIST). */
+static bool renew(const struct files_work *work, const struct file *w, const struct file *n,
 		  const struct file_watch *watch)
 {
 	const struct file *of = files_find(work->want, watch->of);
 	const struct file_watch *is = files_find_watch(n, watch);
 
+	if (work->kept[files_index(work->want, w)] && work->kept[files_index(work->want, of)])
+		return false;
 	return !is || is->events != watch->events || is->data != watch->data ||
 	       work->lost[files_index(work->want, of)] || of->kind == FILE_SIGNALFD ||
 	       of->kind == FILE_EPOLL || watch->events & (EPOLLET | EPOLLONESHOT);
@@ -185,7 +188,7 @@ void files_list_epoll(const struct files_work *work, struct setup *setup, const 
 		const struct file *of = files_find(work->want, watch->of);
 		enum inj_stage stage;
 
-		if (!of || !renew(work, n, watch))
+		if (!of || !renew(work, w, n, watch))
 			continue;
 		stage = of->pid_inside ? INJ_OWNERS : INJ_DESCRIPTORS; /* when it is there */
 		if (watch->of == watch->fd)

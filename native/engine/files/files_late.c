@@ -95,22 +95,22 @@ static bool may_ask(const struct process *process)
 }
 
 /* Has the holder begin with its calls. */
-static int start(const struct process *process)
+static int start(const struct process *process, struct inj_call *call)
 {
 	struct avc_error ignored = { 0 };
 
-	return parasite_send(&process->parasite, process->holder, &process->holder_base,
-			     &process->parasite.control->holder, &ignored) ||
+	return parasite_send(&process->parasite, process->holder, &process->holder_base, call,
+			     &ignored) ||
 			       parasite_start(process->holder, &ignored)
 		       ? -1
 		       : 0;
 }
 
-static int finish(const struct process *process)
+static int finish(const struct process *process, struct inj_call *call)
 {
 	struct avc_error ignored = { 0 };
 
-	return parasite_finish(process->holder, &process->parasite.control->holder, &ignored);
+	return parasite_finish(process->holder, call, &ignored);
 }
 
 /* Whatever it still has is closed with it. */
@@ -134,7 +134,7 @@ uint64_t files_looked_at(const struct files_work *work)
 void files_take_late(const struct files_work *work)
 {
 	struct process *process = work->process;
-	struct inj_call *call = &process->parasite.control->holder;
+	struct inj_call *call = &process->parasite.control->late;
 	const uint64_t looked_at = files_looked_at(work);
 
 	if (!looked_at)
@@ -142,7 +142,7 @@ void files_take_late(const struct files_work *work)
 	call_begin(call, INJ_AFTER_PARK);
 	/* Filters that forbid unshare(2) allow this. */
 	call_add(call, SYS_close_range, ~0u, ~0u, CLOSE_RANGE_UNSHARE);
-	if (start(process) || finish(process)) {
+	if (start(process, call) || finish(process, call)) {
 		end(process);
 		return;
 	}
@@ -153,7 +153,7 @@ void files_take_late(const struct files_work *work)
 	if (close_all(call, work->now, work->closed, 2)) {
 		call_add(call, INJ_CLOSE_CLAIMS, 0, looked_at - 1);
 		call_add(call, SYS_close_range, looked_at, ~0u);
-		process->late = start(process) == 0;
+		process->late = start(process, call) == 0;
 	}
 	if (!process->late)
 		end(process);
@@ -161,7 +161,7 @@ void files_take_late(const struct files_work *work)
 
 void files_await_late(const struct process *process)
 {
-	if (process->late && finish(process))
+	if (process->late && finish(process, &process->parasite.control->late))
 		end(process);
 }
 
@@ -171,7 +171,7 @@ bool files_start_closing(const struct process *process)
 
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_close_range, 0, ~0u);
-	return start(process) == 0;
+	return start(process, call) == 0;
 }
 
 bool files_start_closing_claims(const struct process *process, const struct files *had)
@@ -179,11 +179,12 @@ bool files_start_closing_claims(const struct process *process, const struct file
 	struct inj_call *call = &process->parasite.control->holder;
 
 	call_begin(call, INJ_AFTER_PARK);
-	return close_all(call, had, NULL, 0) ? start(process) == 0 : files_start_closing(process);
+	return close_all(call, had, NULL, 0) ? start(process, call) == 0
+					     : files_start_closing(process);
 }
 
 void files_close_late(const struct process *process)
 {
-	if (files_start_closing(process) && finish(process))
+	if (files_start_closing(process) && finish(process, &process->parasite.control->holder))
 		end(process);
 }
