@@ -100,6 +100,21 @@ def test_as_many_processes_as_are_supported(tmp_path: Path) -> None:
             crowd.wait_beats()
 
 
+def test_as_many_descriptors_as_can_be_read_in_time(tmp_path: Path) -> None:
+    """40,000: a process that was asked waits until those of the others are read, longer than for a clone."""
+    with (
+        Victim("crowd watched 4 4000", tmp_path) as crowd,
+        GuardProcess(config(freeze_deadline_s=1.0), [crowd.pid]) as guard,
+    ):
+        for _ in range(2):
+            told = guard.command("checkpoint", timeout_s=PATIENCE_S)
+            assert told["kind"] == "checkpoint", told
+        since = guard.mark()
+        kill_main(crowd)
+        guard.wait("restored", since=since, timeout_s=PATIENCE_S)
+        crowd.wait_beats()
+
+
 def test_templates_that_nobody_has_reaped_are_not_counted(tmp_path: Path) -> None:
     """Init gets no CPU to wait for those of dropped generations, which are its children."""
     with (

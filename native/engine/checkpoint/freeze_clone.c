@@ -23,6 +23,7 @@
 #define CLONE_PROCESS_NS 100000
 #define CLONE_PAGE_NS 90
 #define CLONES_MAX_NS NS_PER_S
+#define FILE_NS 10000
 /* The factor by which they may exceed that. */
 #define PATIENCE 4
 
@@ -384,6 +385,18 @@ static uint64_t clone_time_ns(long anon_pages)
 	return CLONE_PROCESS_NS + (uint64_t)anon_pages * CLONE_PAGE_NS;
 }
 
+/* The same for the descriptors of all of them, as many as there were right before: whoever has been
+ * asked waits while we read those of the others. */
+static uint64_t read_time_ns(const struct tree *tree)
+{
+	uint64_t takes_ns = 0;
+
+	for (uint32_t i = 0; i < tree->count; i++)
+		if (tree->entry[i].process)
+			takes_ns += (uint64_t)tree->entry[i].process->files_seen * FILE_NS;
+	return takes_ns;
+}
+
 uint64_t freeze_clones_time_ns(const struct tree *tree)
 {
 	uint64_t takes_ns = 0;
@@ -411,7 +424,8 @@ int freeze_begin_known(struct freeze *freeze, struct avc_error *err)
 {
 	const struct tree *tree = freeze->tree;
 	const struct image *main = &freeze->generation->image[0];
-	const uint64_t all_ns = tree->count > 1 ? freeze_clones_time_ns(tree) : 0;
+	const uint64_t all_ns = tree->count > 1 ? freeze_clones_time_ns(tree) + read_time_ns(tree)
+						: 0;
 	uint64_t takes_ns = 0;
 
 	/* Not while it is being cloned. */
@@ -434,7 +448,9 @@ int freeze_begin_known(struct freeze *freeze, struct avc_error *err)
 int freeze_begin_others(struct freeze *freeze, struct avc_error *err)
 {
 	const struct generation *generation = freeze->generation;
-	const uint64_t all_ns = generation->images > 1 ? freeze_clones_time_ns(freeze->tree) : 0;
+	const uint64_t all_ns = generation->images > 1 ? freeze_clones_time_ns(freeze->tree) +
+								 read_time_ns(freeze->tree)
+						       : 0;
 
 	for (uint32_t i = 0; i < generation->images; i++) {
 		struct process *process = generation->image[i].process;
