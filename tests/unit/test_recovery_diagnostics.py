@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
 import socket
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -116,71 +118,59 @@ def test_news_of_something_else_hides_no_lack_of_protection(node: ModuleType) ->
     assert [status.level for status in board.statuses(1016.0)] == [node.OK, node.OK]
 
 
-@pytest.mark.parametrize(("state", "known"), [("nodes", False), ("listening", False), ("starting", True)])
-def test_a_launcher_is_no_lasting_warning(node: ModuleType, tmp_path: Path, state: str, known: bool) -> None:
-    """No checkpoint of it ever follows."""
-    path = tmp_path / "api.sock"
-    asked: list[str] = []
+@contextlib.contextmanager
+def following(
+    node: ModuleType, path: Path, answers: Sequence[str], board: Any, changed: Callable[[Any], object]
+) -> Iterator[tuple[list[str], threading.Thread]]:
+    """It follows a sidecar that gives these answers, one connection each; what that was asked, and what ends
+    after the last.
+    """
+    requests: list[str] = []
+    stopped = threading.Event()
 
     def serve() -> None:
-        for text in (
-            f"id: 41\ndata: {json.dumps(event(Kind.REGISTERED))}\n\n",
-            json.dumps({"container": {"state": state}}),
-        ):
+        for text in answers:
             connection, _ = server.accept()
             with connection:
-                asked.append(connection.recv(4096).decode().split()[1])
+                requests.append(connection.recv(4096).decode())
                 connection.sendall(f"HTTP/1.1 200 OK\r\nContent-Length: {len(text)}\r\n\r\n{text}".encode())
 
-    board, stopped = node.Board(), threading.Event()
+    serving = threading.Thread(target=serve, daemon=True)
+    follower = threading.Thread(target=node.follow, args=(str(path), board, changed, stopped), daemon=True)
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(path))
         server.listen()
-        threads = [
-            threading.Thread(target=serve, daemon=True),
-            threading.Thread(target=node.follow, args=(str(path), board, print, stopped), daemon=True),
-        ]
-        for thread in threads:
-            thread.start()
-        threads[0].join(10)
+        serving.start()
+        follower.start()
+        yield requests, serving
         stopped.set()
-    threads[1].join(20)
-    assert asked == ["/v1/events", f"/v1/containers/{'ab' * 32}"]
+    follower.join(20)
+
+
+@pytest.mark.parametrize(("state", "known"), [("nodes", False), ("listening", False), ("starting", True)])
+def test_a_launcher_is_no_lasting_warning(node: ModuleType, tmp_path: Path, state: str, known: bool) -> None:
+    """No checkpoint of it ever follows."""
+    path, board = tmp_path / "api.sock", node.Board()
+    answers = [
+        f"id: 41\ndata: {json.dumps(event(Kind.REGISTERED))}\n\n",
+        json.dumps({"container": {"state": state}}),
+    ]
+    with following(node, path, answers, board, print) as (asked, serving):
+        serving.join(10)
+    assert [request.split()[1] for request in asked] == ["/v1/events", f"/v1/containers/{'ab' * 32}"]
     assert [status.name for status in board.statuses(1000.0)[1:]] == (["avckpt: lidar"] if known else [])
 
 
 def test_it_resumes_where_it_was_when_the_sidecar_comes_back(node: ModuleType, tmp_path: Path) -> None:
-    path = tmp_path / "api.sock"
+    path, board = tmp_path / "api.sock", node.Board()
     now = time.time()
-    requests: list[str] = []
     answers = [
-        [f"retry: 1000\n\nid: 41\ndata: {json.dumps(restored(now - 60))}\n\n", ": nothing new\n\n"],
-        [f"id: 42\ndata: {json.dumps(restored(now + 60))}\n\n"],
+        f"retry: 1000\n\nid: 41\ndata: {json.dumps(restored(now - 60))}\n\n: nothing new\n\n",
+        f"id: 42\ndata: {json.dumps(restored(now + 60))}\n\n",
     ]
-
-    def serve() -> None:
-        for parts in answers:
-            connection, _ = server.accept()
-            with connection:
-                requests.append(connection.recv(4096).decode())
-                text = "".join(parts)
-                connection.sendall(f"HTTP/1.1 200 OK\r\nContent-Length: {len(text)}\r\n\r\n{text}".encode())
-
     changed: list[Any] = []
-    board, stopped = node.Board(), threading.Event()
-    with socket.socket(socket.AF_UNIX) as server:
-        server.bind(str(path))
-        server.listen()
-        threads = [
-            threading.Thread(target=serve, daemon=True),
-            threading.Thread(target=node.follow, args=(str(path), board, changed.append, stopped), daemon=True),
-        ]
-        for thread in threads:
-            thread.start()
+    with following(node, path, answers, board, changed.append) as (requests, _):
         wait_until(lambda: changed, 10, "the second event")
-        stopped.set()
-        for thread in threads:
-            thread.join(10)
     # What was before it started is on the board, but is no news.
     assert len(changed) == 1
     assert "Last-Event-ID" not in requests[0]
