@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from testkit.family import kill_main
 from testkit.guarded import GuardProcess, Victim, config, kill_at_random
 from testkit.harness import SLOWNESS, wait_until
 from testkit.scenario import disturb, restored
@@ -44,9 +43,7 @@ def test_what_a_set_watches_is_registered_again_by_one_of_them(tmp_path: Path) -
     with Victim("crowd watched 4 500", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for _ in range(6):
             assert guard.checkpoint()["kind"] == "checkpoint"
-            since = guard.mark()
-            kill_main(victim)
-            event = guard.wait("restored", since=since)
+            event = restored(victim, guard, looks=False)
             assert "error" not in event, event
             victim.wait_beats()
 

@@ -15,7 +15,6 @@
 #include <signal.h>
 #include <sys/epoll.h>
 #include <sys/eventfd.h>
-#include <sys/resource.h>
 #include <sys/stat.h>
 #include <sys/wait.h>
 
@@ -29,20 +28,11 @@ static void *map(size_t bytes, int protection, int flags)
 	return at;
 }
 
-static void lift_limit(void)
-{
-	struct rlimit limit;
-
-	must(!getrlimit(RLIMIT_NOFILE, &limit), "getrlimit");
-	limit.rlim_cur = limit.rlim_max;
-	must(!setrlimit(RLIMIT_NOFILE, &limit), "setrlimit");
-}
-
 static void open_named(size_t many)
 {
 	char name[251];
 
-	lift_limit();
+	victim_lift_descriptors();
 	memset(name, 'n', sizeof name - 1);
 	name[sizeof name - 1] = 0;
 	for (int depth = 0; depth < 12; depth++)
@@ -51,12 +41,17 @@ static void open_named(size_t many)
 		must(open(name, O_RDWR | O_CREAT, 0600) >= 0, "open");
 }
 
-static void open_watched(void)
+static void open_watched(size_t many)
 {
 	struct epoll_event event = { .events = EPOLLIN };
-	const int set = epoll_create1(0), watched = eventfd(0, 0);
 
-	must(set >= 0 && watched >= 0 && !epoll_ctl(set, EPOLL_CTL_ADD, watched, &event), "epoll");
+	victim_lift_descriptors();
+	for (size_t i = 0; i < many; i++) {
+		const int set = epoll_create1(0), watched = eventfd(0, 0);
+
+		must(set >= 0 && watched >= 0 && !epoll_ctl(set, EPOLL_CTL_ADD, watched, &event),
+		     "epoll");
+	}
 }
 
 static void have(const char *kind, size_t many)
@@ -115,10 +110,8 @@ int main(int argc, char **argv)
 	there = map(4096, PROT_READ | PROT_WRITE, MAP_SHARED);
 	if (!strcmp(argv[1], "common"))
 		map(many << 20, PROT_READ | PROT_WRITE, MAP_SHARED);
-	if (!strcmp(argv[1], "watched"))
-		lift_limit();
-	for (size_t i = 0; !strcmp(argv[1], "watched") && i < many; i++)
-		open_watched();
+	else if (!strcmp(argv[1], "watched"))
+		open_watched(many);
 	for (int i = 0; i < processes; i++) {
 		const pid_t child = fork();
 

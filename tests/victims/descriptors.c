@@ -221,11 +221,7 @@ enum { MANY = 19000 };
 /* Not one after the other either. */
 static void many_disturb(void)
 {
-	struct rlimit limit;
-
-	must(!getrlimit(RLIMIT_NOFILE, &limit), "getrlimit");
-	limit.rlim_cur = limit.rlim_max;
-	must(!setrlimit(RLIMIT_NOFILE, &limit), "setrlimit");
+	victim_lift_descriptors();
 	for (int i = 0; i < MANY; i++)
 		must(open("/dev/null", O_RDONLY) >= 0, "open");
 	for (int i = 100; i < MANY; i += 1000)

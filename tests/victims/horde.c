@@ -12,7 +12,6 @@
 #include <sys/epoll.h>
 #include <sys/eventfd.h>
 #include <sys/random.h>
-#include <sys/resource.h>
 #include <sys/socket.h>
 #include <sys/un.h>
 
@@ -128,26 +127,23 @@ static void open_all(int n, const char *kind)
 int main(int argc, char **argv)
 {
 	struct sigaction act = { .sa_handler = on_signal };
-	struct rlimit limit;
 	const char *kind;
-	int n;
+	int n, most;
 
 	victim_start(&argc, argv, 2, "N KIND [again]");
 	n = atoi(argv[1]);
 	kind = argv[2];
-	must(!getrlimit(RLIMIT_NOFILE, &limit), "getrlimit");
 	must(getrandom(&own, sizeof own, 0) == sizeof own, "getrandom");
-	limit.rlim_cur = limit.rlim_max;
-	must(!setrlimit(RLIMIT_NOFILE, &limit), "setrlimit");
-	if (n > (int)limit.rlim_max - 2 * FIRST) {
-		printf("this machine allows %d descriptors\n", (int)limit.rlim_max);
+	most = (int)victim_lift_descriptors();
+	if (n > most - 2 * FIRST) {
+		printf("this machine allows %d descriptors\n", most);
 		return UNAVAILABLE_STATUS;
 	}
 	if (!strcmp(kind, "streams"))
 		for (int i = 0; i <= n / BACKLOG; i++)
-			move_up(listener(i, SOCK_STREAM), (int)limit.rlim_cur - 100);
+			move_up(listener(i, SOCK_STREAM), most - 100);
 	if (!strcmp(kind, "datagrams"))
-		move_up(listener(0, SOCK_DGRAM), (int)limit.rlim_cur - 100);
+		move_up(listener(0, SOCK_DGRAM), most - 100);
 	open_all(n, kind);
 	sigaction(SIGUSR1, &act, NULL);
 	victim_ready();

@@ -14,7 +14,6 @@
 #include <sys/file.h>
 #include <sys/mman.h>
 #include <sys/random.h>
-#include <sys/resource.h>
 #include <sys/socket.h>
 #include <sys/un.h>
 
@@ -168,14 +167,11 @@ int main(int argc, char **argv)
 	const bool again = victim_flag(&argc, argv, "--again");
 	const bool parent = victim_flag(&argc, argv, "--parent");
 	struct sigaction act = { .sa_handler = on_signal, .sa_flags = SA_RESTART };
-	struct rlimit limit;
 	uint64_t opened = 0;
 	int claimed[CLAIMS];
 
 	victim_start(&argc, argv, 2, "N KIND [--closes] [--again] [--claims] [--parent]");
-	must(!getrlimit(RLIMIT_NOFILE, &limit), "getrlimit");
-	limit.rlim_cur = limit.rlim_max;
-	must(!setrlimit(RLIMIT_NOFILE, &limit), "setrlimit");
+	victim_lift_descriptors();
 	must(open("/etc/passwd", O_RDONLY) >= 0 && dup2(0, OWN) == OWN, "open");
 	must(dup2(open("/etc/group", O_RDONLY), OWN) == OWN, "dup2");
 	make_listener();

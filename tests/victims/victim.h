@@ -28,6 +28,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/mman.h>
+#include <sys/resource.h>
 #include <sys/syscall.h>
 #include <sys/wait.h>
 #include <time.h>
@@ -259,6 +260,17 @@ static inline void victim_ready(void)
 	__atomic_store_n(&board->ready, 1, __ATOMIC_RELEASE);
 	if (write(STDOUT_FILENO, "ready\n", 6) < 0)
 		return;
+}
+
+/* As many descriptors as the hard limit allows; how many that are. */
+static inline rlim_t victim_lift_descriptors(void)
+{
+	struct rlimit limit;
+
+	must(!getrlimit(RLIMIT_NOFILE, &limit), "getrlimit");
+	limit.rlim_cur = limit.rlim_max;
+	must(!setrlimit(RLIMIT_NOFILE, &limit), "setrlimit");
+	return limit.rlim_max;
 }
 
 /* A nap that nothing may cut short. */

@@ -321,26 +321,26 @@ def _whole(text: str, least: int, most: int) -> int:
     return int(text)
 
 
-def _parse_enable(text: str) -> dict[str, Any]:
+def _truth(text: str, otherwise: str) -> bool:
+    """Also as YAML's boolean: of `off` without quotes Compose makes the label "False"."""
     if text.lower() not in _TRUE | _FALSE:
-        raise ValueError("neither true nor false")
-    return {"enable": text.lower() in _TRUE}
+        raise ValueError(otherwise)
+    return text.lower() in _TRUE
+
+
+def _parse_enable(text: str) -> dict[str, Any]:
+    return {"enable": _truth(text, "neither true nor false")}
 
 
 def _on_or_off(field_name: str) -> Callable[[str], dict[str, Any]]:
     def parse(text: str) -> dict[str, Any]:
-        # Of `off` without quotes YAML makes a boolean, and Compose the label "False".
-        if text.lower() not in _TRUE | _FALSE:
-            raise ValueError("neither on nor off")
-        return {field_name: text.lower() in _TRUE}
+        return {field_name: _truth(text, "neither on nor off")}
 
     return parse
 
 
 def _parse_core(text: str) -> dict[str, Any]:
-    if text != "mini" and text.lower() not in _TRUE | _FALSE:
-        raise ValueError("unknown value")
-    return {"core": text if text == "mini" else "on" if text.lower() in _TRUE else "off"}
+    return {"core": text if text == "mini" else "on" if _truth(text, "unknown value") else "off"}
 
 
 def _parse_interval(text: str) -> dict[str, Any]:

@@ -385,8 +385,7 @@ static uint64_t clone_time_ns(long anon_pages)
 	return CLONE_PROCESS_NS + (uint64_t)anon_pages * CLONE_PAGE_NS;
 }
 
-/* The same for the descriptors of all of them, as many as there were right before: whoever has been
- * asked waits while we read those of the others. */
+/* The same for reading the descriptors of all of them, as many as there were right before. */
 static uint64_t read_time_ns(const struct tree *tree)
 {
 	uint64_t takes_ns = 0;
@@ -412,6 +411,12 @@ uint64_t freeze_clones_time_ns(const struct tree *tree)
 	return takes_ns;
 }
 
+/* How long one that has been asked may have to wait for the others. */
+static uint64_t others_time_ns(const struct tree *tree)
+{
+	return tree->count > 1 ? freeze_clones_time_ns(tree) + read_time_ns(tree) : 0;
+}
+
 /* One that can be cloned at once, and whose clone time is known. */
 static bool is_ready(const struct process *process)
 {
@@ -424,8 +429,7 @@ int freeze_begin_known(struct freeze *freeze, struct avc_error *err)
 {
 	const struct tree *tree = freeze->tree;
 	const struct image *main = &freeze->generation->image[0];
-	const uint64_t all_ns = tree->count > 1 ? freeze_clones_time_ns(tree) + read_time_ns(tree)
-						: 0;
+	const uint64_t others_ns = others_time_ns(tree);
 	uint64_t takes_ns = 0;
 
 	/* Not while it is being cloned. */
@@ -439,7 +443,7 @@ int freeze_begin_known(struct freeze *freeze, struct avc_error *err)
 			takes_ns += clone_time_ns(process->anon_pages);
 		if (takes_ns > CLONES_AHEAD_NS)
 			break;
-		if (begin(process, main->slot, all_ns, err))
+		if (begin(process, main->slot, others_ns, err))
 			return -1;
 	}
 	return 0;
@@ -448,15 +452,13 @@ int freeze_begin_known(struct freeze *freeze, struct avc_error *err)
 int freeze_begin_others(struct freeze *freeze, struct avc_error *err)
 {
 	const struct generation *generation = freeze->generation;
-	const uint64_t all_ns = generation->images > 1 ? freeze_clones_time_ns(freeze->tree) +
-								 read_time_ns(freeze->tree)
-						       : 0;
+	const uint64_t others_ns = others_time_ns(freeze->tree);
 
 	for (uint32_t i = 0; i < generation->images; i++) {
 		struct process *process = generation->image[i].process;
 
 		if (process && process->stage < FREEZE_BEGUN &&
-		    begin(process, generation->image[i].slot, all_ns, err))
+		    begin(process, generation->image[i].slot, others_ns, err))
 			return -1;
 	}
 	return 0;

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from avckpt.cli.client import Client, Json
 
 RETRY_S = 1.0
+"""How often somebody who follows looks whether the sidecar is back."""
 
 UNGUARDED = ("listening", "nodes")
-"""States of those that have no generations of their own, and lack none."""
-"""How often somebody who follows looks whether the sidecar is back."""
+"""States of those that have no generations of their own, and lack none (State.guarded)."""
 
 COLOURS = {
     "restored": "yellow",

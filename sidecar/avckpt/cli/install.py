@@ -180,9 +180,8 @@ def install(root: Path = _HOST, *, quadlet: bool = False) -> list[str]:
         line = f"# avckpt: where hooks and sidecar meet\nd {_run_dir()} 0755 root root -\n"
         files.append(_File(TMPFILES, line.encode()))
         done.append(f"{TMPFILES}: makes {_run_dir()} when the machine starts")
-    unit = _File(QUADLET, artifacts.packaging(QUADLET.name).read_bytes())
     if quadlet or QUADLET in before.files:
-        files.append(unit)
+        files.append(_File(QUADLET, artifacts.packaging(QUADLET.name).read_bytes()))
         done.append(f"{QUADLET}: the sidecar as a unit of systemd (Podman 4.4 or newer; systemctl daemon-reload)")
     # Last: from here on Podman calls the hooks.
     directories = containers_conf.with_directory(root, HOOKS_DIR, without=DROP_IN)
@@ -192,9 +191,11 @@ def install(root: Path = _HOST, *, quadlet: bool = False) -> list[str]:
     try:
         with contextlib.ExitStack() as undo:
             writer = _Writer(root, undo)
-            if unit in files and (aside := _set_aside(root, unit, undo)):
-                done.append(f"warning: {QUADLET} was another, which is kept as {aside.name}: yours may have changes")
             for file in files:
+                if file.path == QUADLET and (aside := _set_aside(root, file, undo)):
+                    done.append(
+                        f"warning: {QUADLET} was another, which is kept as {aside.name}: yours may have changes"
+                    )
                 writer.file(file)
             for path in (_run_dir(), CONFIG_DIR, *_CACHES):
                 writer.directory(path)

@@ -37,7 +37,6 @@ def web(listen: str, port: int, names: tuple[str, ...], token_file: Path | None,
     /v1/events and /v1/history, with the header "Authorization: Bearer TOKEN".
     """
     import asyncio
-    import contextlib
     import secrets
 
     from avckpt_hooks.shared import protocol
@@ -58,11 +57,12 @@ def web(listen: str, port: int, names: tuple[str, ...], token_file: Path | None,
         finally:
             await runner.cleanup()
 
-    with contextlib.suppress(KeyboardInterrupt):
-        try:
-            asyncio.run(serve())
-        except SidecarUnreachable as error:
-            raise SidecarUnreachable(f"{error}: {start_it(Path(protocol.run_dir()))}") from None
+    try:
+        asyncio.run(serve())
+    except KeyboardInterrupt:
+        pass
+    except SidecarUnreachable as error:
+        raise SidecarUnreachable(f"{error}: {start_it(Path(protocol.run_dir()))}") from None
 
 
 def read_token(path: Path) -> str:
